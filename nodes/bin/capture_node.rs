@@ -1,0 +1,2 @@
+//! capture_node
+fn main() {}

@@ -1,0 +1,2 @@
+//! feature_node
+fn main() {}

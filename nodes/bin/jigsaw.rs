@@ -1,0 +1,2 @@
+//! jigsaw
+fn main() {}

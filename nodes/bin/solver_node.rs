@@ -1,0 +1,2 @@
+//! solver_node
+fn main() {}

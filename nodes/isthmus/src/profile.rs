@@ -1,0 +1,1 @@
+//! Isthmus distance functions.

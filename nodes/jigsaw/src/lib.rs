@@ -1,0 +1,83 @@
+//! Apictorial jigsaw puzzles: candidate matings from isthmuses, placement with clearance, assembly with backtracking.
+//!
+//! Coordinates are pixels: x right, y **down**. Transforms are `target_from_source`.
+
+use nalgebra::Isometry2;
+
+/// A piece as the solver knows it.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Piece {
+    /// Unique name.
+    pub id: String,
+    /// Its shape.
+    pub features: isthmus::Features,
+}
+
+/// Counts of the candidate table after each rule (paper, section on heuristics).
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, serde::Serialize)]
+pub struct TableCounts {
+    /// Positive isthmuses.
+    pub positive: usize,
+    /// Negative isthmuses.
+    pub negative: usize,
+    /// Pairs of a positive and a negative isthmus of different pieces.
+    pub pairs: usize,
+    /// Left after the opening rule.
+    pub after_opening: usize,
+    /// Left after the path length rule.
+    pub after_length: usize,
+    /// Left after the correlation.
+    pub after_correlation: usize,
+    /// Left after the overlap rule.
+    pub after_overlap: usize,
+    /// Times the assembly went back on a mating.
+    pub backtracks: usize,
+}
+
+/// Two pieces joined at a positive and a negative isthmus.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Mating {
+    /// Index of the piece with the tab.
+    pub positive_piece: usize,
+    /// Index of its isthmus.
+    pub positive_isthmus: usize,
+    /// Index of the piece with the blank.
+    pub negative_piece: usize,
+    /// Index of its isthmus.
+    pub negative_isthmus: usize,
+    /// Best value of Eq. 1, in `-1..=1`.
+    pub correlation: f64,
+    /// Mean gap along the match segment after refinement, clearance taken off, in pixels.
+    pub ave_gap: f64,
+    /// Fitted clearance (kerf) between the two borders, in pixels; negative where they overlap.
+    pub clearance: f64,
+    /// Probability that the mating is right.
+    pub confidence: f64,
+}
+
+/// Where a piece belongs.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Placement {
+    /// Index of the piece.
+    pub piece: usize,
+    /// `p_puzzle = puzzle_from_image * p_image`.
+    pub puzzle_from_image: Isometry2<f64>,
+    /// Connected assembly it belongs to; 0 is the largest.
+    pub component: usize,
+    /// Probability that the piece is where it belongs.
+    pub confidence: f64,
+}
+
+/// The result of the solver. All components lie in one puzzle frame, side by side, without overlap; the main one
+/// has its top left corner at the origin.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub struct Assembly {
+    /// The placed pieces.
+    pub placements: Vec<Placement>,
+    /// All contacts between them.
+    pub matings: Vec<Mating>,
+    /// Pieces left over.
+    pub unplaced: Vec<usize>,
+    /// The candidate table after each rule.
+    pub table: TableCounts,
+}

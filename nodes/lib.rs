@@ -1,0 +1,5 @@
+//! The isthmus jigsaw cell: camera frames in, piece poses out. The pipeline on one page:
+//!
+//! ```text
+//! image ── capture ── pieces/image ── feature ── pieces/features ── solver ── assembly, /tf_static
+//! ```
