@@ -4,6 +4,12 @@
 
 use nalgebra::Isometry2;
 
+pub mod params;
+pub mod solver;
+
+pub use params::{Params, ParamsError, Policy};
+pub use solver::{Candidate, Fate, Rule, Solver, SolverError, assemble};
+
 /// A piece as the solver knows it.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Piece {
@@ -80,4 +86,17 @@ pub struct Assembly {
     pub unplaced: Vec<usize>,
     /// The candidate table after each rule.
     pub table: TableCounts,
+    /// Whether the time budget ran out, so that this is the best assembly so far.
+    pub partial: bool,
+    /// Where the time went.
+    pub timings: Timings,
+}
+
+/// Wall-clock seconds of the solver's stages.
+#[derive(Debug, Clone, Copy, PartialEq, Default, serde::Serialize)]
+pub struct Timings {
+    /// Preparing pieces and finding and refining candidates (of the pieces inserted since the last solution).
+    pub matching: f64,
+    /// Assembling.
+    pub assembly: f64,
 }
