@@ -1,6 +1,39 @@
 //! Sub-pixel border of a shape.
+//!
+//! # Method
+//! 1. *Iso-contour* of the grey picture half-way between the levels of shape and ground, by marching squares with
+//!    linear interpolation (W. E. Lorensen, H. E. Cline, *Marching cubes*, SIGGRAPH 1987, in the plane). A diagonal
+//!    cell joins the shape where its mean lies on the shape's side (G. M. Nielson, B. Hamann, *The asymptotic
+//!    decider*, Visualization 1991). Of all closed contours the longest outer one is taken.
+//! 2. A picture that is too noisy or too sharp (one-bit, without grey levels at the edge) for linear interpolation is
+//!    blurred first: just enough, as the measured noise and edge slope ask for.
+//! 3. *Resampling* at equal steps of about one pixel of arc length.
+//! 4. *Smoothing* by a Gaussian along the border. Its width balances what is left of the measured noise against the
+//!    rounding of the tightest curves: a Gaussian of standard deviation `s` leaves `noise^2 / (2 sqrt(pi) s)` of the
+//!    variance and moves a curve of radius `r` by `s^2 / (2 r)`; the sum of squares is least at
+//!    `s^5 = noise^2 r^2 / (2 sqrt(pi))`.
+//!
+//! The border's noise is measured on the border itself: the fourth difference of its points across the border, a
+//! filter that curves of the shape do not pass (median absolute deviation, so that corners do not count).
+//!
+//! # Cost
+//! One pass over the cutout to find the contours, then linear in the length of the border.
+//!
+//! # Failure
+//! [`ContourError`]: no contrast, nothing at the level, a border too short or too long to be a shape.
+//!
+//! ```
+//! use isthmus::{Point, contour::Border};
+//! let square = [(0.0, 0.0), (40.0, 0.0), (40.0, 40.0), (0.0, 40.0)].map(|(x, y)| Point::new(x, y));
+//! let border = Border::from_points(&square)?;
+//! assert_eq!(border.points.len(), 160);
+//! assert!((border.area() - 1600.0).abs() < 1e-9);
+//! # Ok::<(), isthmus::contour::ContourError>(())
+//! ```
 
 use crate::Point;
+use crate::mask::Cutout;
+use nalgebra::Vector2;
 
 /// A closed border: the last point joins the first. Points are equally spaced along it and run so that the shoelace
 /// area in (x right, y down) is positive: clockwise as seen on a screen, the outward normal being `(dy, -dx)`.
@@ -10,4 +43,603 @@ pub struct Border {
     pub points: Vec<Point>,
     /// Arc length between consecutive points, in pixels.
     pub spacing: f64,
+}
+
+/// Why there is no border.
+#[derive(Debug, Clone, PartialEq, thiserror::Error)]
+#[non_exhaustive]
+pub enum ContourError {
+    /// The cutout's pixel count is not that of its window.
+    #[error("cutout holds {pixels} pixels: its window of {width} x {height} needs width * height of them")]
+    PixelCount {
+        /// Pixels there are.
+        pixels: usize,
+        /// Columns of the window.
+        width: u32,
+        /// Rows of the window.
+        height: u32,
+    },
+    /// The levels of shape and ground are (nearly) the same, or not numbers.
+    #[error("shape level {shape_level} and ground level {ground_level} must differ by at least {MIN_CONTRAST}")]
+    Contrast {
+        /// Grey level of the shape.
+        shape_level: f32,
+        /// Grey level of the ground.
+        ground_level: f32,
+    },
+    /// No closed contour of the shape at the level between shape and ground.
+    #[error("no closed contour at grey level {level}")]
+    Nothing {
+        /// The level.
+        level: f32,
+    },
+    /// A coordinate is not a finite number of at most [`MAX_COORDINATE`].
+    #[error("point {index} of the outline is ({x}, {y}): coordinates must be finite and at most {MAX_COORDINATE:e}")]
+    Coordinate {
+        /// Index of the point.
+        index: usize,
+        /// Its x.
+        x: f64,
+        /// Its y.
+        y: f64,
+    },
+    /// The spacing is not positive and finite.
+    #[error("spacing {spacing} must be positive and finite")]
+    Spacing {
+        /// The spacing.
+        spacing: f64,
+    },
+    /// The border is too short for its spacing to be a shape.
+    #[error("border of {length} px must be at least {MIN_POINTS} times its spacing of {spacing} px")]
+    TooShort {
+        /// Length of the border in pixels.
+        length: f64,
+        /// Spacing of its points in pixels.
+        spacing: f64,
+    },
+    /// The border needs too many points.
+    #[error("border of {length} px at a spacing of {spacing} px needs more than {MAX_POINTS} points")]
+    TooLong {
+        /// Length of the border in pixels.
+        length: f64,
+        /// Spacing of its points in pixels.
+        spacing: f64,
+    },
+    /// The border encloses nothing.
+    #[error("border encloses an area of {area} px²: it must be at least {minimum}")]
+    NoArea {
+        /// Enclosed area.
+        area: f64,
+        /// The least area a shape may have.
+        minimum: f64,
+    },
+}
+
+/// Least difference of shape and ground level: less is lost in the quantisation of 8-bit grey levels.
+pub const MIN_CONTRAST: f32 = 4.0;
+/// Least number of border points: a disc of 5 px across has 16, and nothing smaller has a measurable shape.
+pub const MIN_POINTS: usize = 16;
+/// Most border points: bounds memory (16 bytes each, and about 20 times that for the triangulation).
+pub const MAX_POINTS: usize = 1 << 24;
+/// Largest coordinate of an outline given directly, in pixels: beyond it the triangulation's predicates lose precision.
+pub const MAX_COORDINATE: f64 = 1e8;
+
+/// Spacing of the border's points in pixels: the resolution of the picture, no more, no less.
+const SPACING: f64 = 1.0;
+/// Step of the fourth difference that measures the noise, in points: neighbours share grey levels, every other one
+/// hardly does.
+const NOISE_STEP: usize = 2;
+/// Standard deviation of the fourth difference (1, -4, 6, -4, 1) of white noise of standard deviation 1.
+const FOURTH_DIFFERENCE: f64 = 8.366_600_265_340_756;
+/// Median absolute deviation of a normal distribution of standard deviation 1.
+const NORMAL_MAD: f64 = 0.674_489_750_196_081_7;
+/// Radius of the tightest curves worth keeping, as a part of the square root of the shape's area: the fillets of a
+/// puzzle piece's tab are about 4 % of its size.
+const TIGHTEST_CURVE: f64 = 0.04;
+/// Least smoothing along the border, in points: takes out the pixel grid's beat in the contour of a clean picture.
+const MIN_SMOOTHING: f64 = 0.7;
+/// A Gaussian kernel ends here, in standard deviations.
+const KERNEL_EXTENT: f64 = 3.0;
+/// Edges narrower than this (standard deviation of the edge's blur, in pixels) alias: linear interpolation errs.
+const MIN_EDGE_BLUR: f64 = 0.6;
+/// What the edges of an aliased picture are widened to, in pixels.
+const EDGE_BLUR: f64 = 1.0;
+/// Most noise at which the contour is traced as it is, as a part of the contrast: at half the contrast being eight
+/// standard deviations away, no pixel is on the wrong side by chance and few near the edge are.
+const MAX_NOISE_TO_CONTRAST: f64 = 1.0 / 16.0;
+/// Most blur against noise, in pixels: more would round the shape's own corners.
+const MAX_BLUR: f64 = 2.5;
+
+impl Border {
+    /// Border from an outline given as the corners of a closed polygon (either sense), resampled at about 1 px.
+    ///
+    /// # Errors
+    /// [`ContourError`] where a coordinate is not finite, or the outline too short, too long or without area.
+    pub fn from_points(outline: &[Point]) -> Result<Self, ContourError> {
+        Self::from_points_spaced(outline, SPACING)
+    }
+
+    /// As [`Border::from_points`], resampled at about `spacing` pixels (so that the border has a whole number of steps).
+    ///
+    /// # Errors
+    /// [`ContourError`] where a coordinate or the spacing is not finite, or the outline too short, too long or
+    /// without area.
+    pub fn from_points_spaced(outline: &[Point], spacing: f64) -> Result<Self, ContourError> {
+        if !(spacing.is_finite() && spacing > 0.0) {
+            return Err(ContourError::Spacing { spacing });
+        }
+        if let Some((index, p)) =
+            outline.iter().enumerate().find(|(_, p)| !(p.x.abs() <= MAX_COORDINATE && p.y.abs() <= MAX_COORDINATE))
+        {
+            return Err(ContourError::Coordinate { index, x: p.x, y: p.y });
+        }
+        let mut border = Self { points: Vec::new(), spacing };
+        border.resample(outline)?;
+        Ok(border)
+    }
+
+    /// Traces the border of a cutout; also gives the standard deviation of its points across the border, in pixels.
+    /// [`crate::Extractor`] does the same and keeps the buffers.
+    ///
+    /// # Errors
+    /// [`ContourError`] where the cutout is inconsistent, has no contrast or shows no shape.
+    pub fn from_cutout(cutout: &Cutout) -> Result<(Self, f64), ContourError> {
+        Tracer::default().trace(cutout)
+    }
+
+    /// Length of the border in pixels.
+    #[must_use]
+    pub fn length(&self) -> f64 {
+        self.points.len() as f64 * self.spacing
+    }
+
+    /// The point at an arc length from the first point (any value, wrapped), on the polygon of the points.
+    #[must_use]
+    pub fn point_at(&self, arc: f64) -> Point {
+        let (i, j, t) = self.locate(arc);
+        self.points[i] + (self.points[j] - self.points[i]) * t
+    }
+
+    /// Unit tangent at an arc length, in the direction of the border.
+    #[must_use]
+    pub fn tangent_at(&self, arc: f64) -> Vector2<f64> {
+        let d = self.point_at(arc + self.spacing) - self.point_at(arc - self.spacing);
+        let norm = d.norm();
+        if norm > 0.0 { d / norm } else { Vector2::x() }
+    }
+
+    /// Unit normal at an arc length, out of the shape.
+    #[must_use]
+    pub fn normal_at(&self, arc: f64) -> Vector2<f64> {
+        let t = self.tangent_at(arc);
+        Vector2::new(t.y, -t.x)
+    }
+
+    /// Arc length from `from` forward to `to`, in `0..length` (wraps round).
+    #[must_use]
+    pub fn forward(&self, from: f64, to: f64) -> f64 {
+        (to - from).rem_euclid(self.length())
+    }
+
+    /// `count` equally spaced points from `arc[0] - extension` forward to `arc[1] + extension`, ends included.
+    #[must_use]
+    pub fn sample(&self, arc: [f64; 2], extension: f64, count: usize) -> Vec<Point> {
+        let path = self.forward(arc[0], arc[1]) + 2.0 * extension;
+        let step = if count > 1 { path / (count - 1) as f64 } else { 0.0 };
+        (0..count).map(|i| self.point_at(arc[0] - extension + i as f64 * step)).collect()
+    }
+
+    /// Enclosed area in square pixels; positive, since the border runs clockwise as seen on a screen.
+    #[must_use]
+    pub fn area(&self) -> f64 {
+        shoelace(&self.points)
+    }
+
+    /// Centroid of the enclosed area.
+    #[must_use]
+    pub fn centroid(&self) -> Point {
+        let Some(&origin) = self.points.first() else { return Point::origin() };
+        let (mut sum, mut twice_area) = (Vector2::zeros(), 0.0);
+        for (p, q) in edges(&self.points) {
+            let (a, b) = (p - origin, q - origin);
+            let cross = a.perp(&b);
+            sum += (a + b) * cross;
+            twice_area += cross;
+        }
+        if twice_area == 0.0 { origin } else { origin + sum / (3.0 * twice_area) }
+    }
+
+    /// Smallest and largest coordinates of the points; `None` without points.
+    #[must_use]
+    pub fn bounds(&self) -> Option<[Point; 2]> {
+        let first = *self.points.first()?;
+        Some(self.points.iter().fold([first; 2], |[low, high], p| [low.inf(p), high.sup(p)]))
+    }
+
+    /// Whether a point lies inside (even-odd rule); linear in the number of points.
+    #[must_use]
+    pub fn contains(&self, point: Point) -> bool {
+        let crossing = |p: &Point, q: &Point| {
+            (p.y > point.y) != (q.y > point.y) && point.x < p.x + (point.y - p.y) / (q.y - p.y) * (q.x - p.x)
+        };
+        edges(&self.points).filter(|(p, q)| crossing(p, q)).count() % 2 == 1
+    }
+
+    /// Index of the point before an arc length, the one after, and how far between them.
+    fn locate(&self, arc: f64) -> (usize, usize, f64) {
+        let n = self.points.len();
+        let position = (arc / self.spacing).rem_euclid(n as f64);
+        let i = (position as usize).min(n - 1);
+        (i, if i + 1 == n { 0 } else { i + 1 }, position - i as f64)
+    }
+
+    /// Fills the border with equally spaced points of a closed polygon, about `self.spacing` apart.
+    fn resample(&mut self, polygon: &[Point]) -> Result<(), ContourError> {
+        let length: f64 = edges(polygon).map(|(p, q)| (q - p).norm()).sum();
+        let spacing = self.spacing;
+        let count = (length / spacing).round();
+        if count < MIN_POINTS as f64 {
+            return Err(ContourError::TooShort { length, spacing });
+        }
+        if count > MAX_POINTS as f64 {
+            return Err(ContourError::TooLong { length, spacing });
+        }
+        let count = count as usize;
+        self.spacing = length / count as f64;
+        self.points.clear();
+        self.points.reserve(count);
+        let mut start = 0.0;
+        for (p, q) in edges(polygon) {
+            let d = q - p;
+            let end = start + d.norm();
+            // The next sample's position is computed, not summed, so that long borders do not drift.
+            let mut next = self.points.len() as f64 * self.spacing;
+            while next < end && self.points.len() < count {
+                self.points.push(p + d * ((next - start) / (end - start)));
+                next = self.points.len() as f64 * self.spacing;
+            }
+            start = end;
+        }
+        while self.points.len() < count {
+            // Rounding can leave out the very last sample, which then is the end of the polygon.
+            self.points.push(polygon[0]);
+        }
+        let area = shoelace(&self.points);
+        if area < 0.0 {
+            self.points.reverse();
+        }
+        let minimum = self.spacing * self.spacing;
+        if area.abs() < minimum {
+            return Err(ContourError::NoArea { area: area.abs(), minimum });
+        }
+        Ok(())
+    }
+}
+
+/// The edges of a closed polygon.
+fn edges(points: &[Point]) -> impl Iterator<Item = (&Point, &Point)> {
+    points.iter().zip(points.iter().cycle().skip(1))
+}
+
+/// Signed area of a closed polygon: positive for one that runs clockwise as seen on a screen (y down).
+fn shoelace(points: &[Point]) -> f64 {
+    let Some(origin) = points.first() else { return 0.0 };
+    edges(points).map(|(p, q)| (p - origin).perp(&(q - origin))).sum::<f64>() / 2.0
+}
+
+/// Traces borders, keeping its buffers from one to the next.
+#[derive(Debug, Clone, Default)]
+pub struct Tracer {
+    padded: Vec<u8>,
+    blurred: Vec<f32>,
+    row_buffer: Vec<f32>,
+    visited: Vec<bool>,
+    contour: Vec<Point>,
+    longest: Vec<Point>,
+    unrolled: Vec<Point>,
+    deviations: Vec<f64>,
+}
+
+/// What tracing a contour tells beside its points.
+struct Trace {
+    /// Mean slope of the grey levels across the contour, in levels a pixel.
+    slope: f64,
+}
+
+impl Tracer {
+    /// The border of a cutout, and the standard deviation of its points across the border, in pixels.
+    ///
+    /// # Errors
+    /// [`ContourError`] where the cutout is inconsistent, has no contrast or shows no shape.
+    pub fn trace(&mut self, cutout: &Cutout) -> Result<(Border, f64), ContourError> {
+        let (width, height) = (cutout.window.width as usize, cutout.window.height as usize);
+        let (shape_level, ground_level) = (cutout.shape_level, cutout.ground_level);
+        if width.checked_mul(height) != Some(cutout.pixels.len()) {
+            return Err(ContourError::PixelCount {
+                pixels: cutout.pixels.len(),
+                width: cutout.window.width,
+                height: cutout.window.height,
+            });
+        }
+        let contrast = (shape_level - ground_level).abs();
+        if !(contrast >= MIN_CONTRAST && contrast.is_finite()) {
+            return Err(ContourError::Contrast { shape_level, ground_level });
+        }
+        let level = (shape_level + ground_level) / 2.0;
+        let mut padded = std::mem::take(&mut self.padded);
+        let margin = pad(cutout, level, &mut padded);
+        let (width, height) = (width + 2 * margin, height + 2 * margin);
+        let pixels = if margin == 0 { &cutout.pixels } else { &padded };
+        let sense = if shape_level > ground_level { 1.0 } else { -1.0 };
+
+        let traced = self.trace_longest(&Raster { pixels, width, height, level, sense });
+        let slope = traced.as_ref().map_or(f64::from(contrast), |t| t.slope);
+        let blur = needed_blur(f64::from(contrast), slope, f64::from(cutout.noise_level));
+        let traced = if blur > 0.0 {
+            let mut blurred = std::mem::take(&mut self.blurred);
+            gaussian_blur(pixels, width, height, blur, &mut self.row_buffer, &mut blurred);
+            fill_rim(&mut blurred, width, ground_level);
+            let traced = self.trace_longest(&Raster { pixels: &blurred, width, height, level, sense });
+            self.blurred = blurred;
+            traced
+        } else {
+            traced
+        };
+        self.padded = padded;
+        traced.ok_or(ContourError::Nothing { level })?;
+
+        let offset =
+            Vector2::new(f64::from(cutout.window.x) - margin as f64, f64::from(cutout.window.y) - margin as f64);
+        for p in &mut self.longest {
+            *p += offset;
+        }
+        let mut border = Border { points: Vec::new(), spacing: SPACING };
+        border.resample(&self.longest)?;
+        let noise = self.smooth(&mut border)?;
+        Ok((border, noise))
+    }
+
+    /// Traces all contours and leaves the longest outer one in `self.longest`.
+    fn trace_longest<P: Grey>(&mut self, raster: &Raster<'_, P>) -> Option<Trace> {
+        let (width, height) = (raster.width, raster.height);
+        self.visited.clear();
+        self.visited.resize(width * height, false);
+        self.longest.clear();
+        let mut best = None;
+        for y in 1..height.saturating_sub(1) {
+            let row = &raster.pixels[y * width..(y + 1) * width];
+            let mut outside = true;
+            for (x, &p) in row.iter().enumerate() {
+                let inside = raster.is_inside(p);
+                if inside && outside && !self.visited[y * width + x] && x > 0 {
+                    let slope = raster.follow(x, y, &mut self.visited, &mut self.contour);
+                    if self.contour.len() > self.longest.len() && shoelace(&self.contour) > 0.0 {
+                        std::mem::swap(&mut self.contour, &mut self.longest);
+                        best = Some(Trace { slope });
+                    }
+                }
+                outside = !inside;
+            }
+        }
+        best
+    }
+
+    /// Smooths a border as much as its noise asks for; gives the standard deviation of the smoothed points.
+    fn smooth(&mut self, border: &mut Border) -> Result<f64, ContourError> {
+        let raw = self.measure_noise(border);
+        let radius = TIGHTEST_CURVE * border.area().sqrt();
+        let kernel_gain = 2.0 * std::f64::consts::PI.sqrt();
+        let sigma = (raw * raw * radius * radius / kernel_gain).powf(0.2).max(MIN_SMOOTHING);
+        let n = border.points.len();
+        let reach = ((KERNEL_EXTENT * sigma).ceil() as usize).min(n / 2);
+        self.unrolled.clear();
+        self.unrolled.extend_from_slice(&border.points[n - reach..]);
+        self.unrolled.extend_from_slice(&border.points);
+        self.unrolled.extend_from_slice(&border.points[..reach]);
+        let mut kernel: Vec<f64> =
+            (0..=2 * reach).map(|i| (-(i as f64 - reach as f64).powi(2) / (2.0 * sigma * sigma)).exp()).collect();
+        let total: f64 = kernel.iter().sum();
+        kernel.iter_mut().for_each(|k| *k /= total);
+        self.contour.clear();
+        self.contour.extend((0..n).map(|i| {
+            let sum = kernel.iter().zip(&self.unrolled[i..]).fold(Vector2::zeros(), |sum, (k, p)| sum + p.coords * *k);
+            Point::from(sum)
+        }));
+        border.spacing = SPACING;
+        border.resample(&self.contour)?;
+        Ok(raw / (kernel_gain * sigma).sqrt())
+    }
+
+    /// Standard deviation of the border's points across the border, in pixels.
+    fn measure_noise(&mut self, border: &Border) -> f64 {
+        let p = &border.points;
+        let n = p.len();
+        let at = |i: usize, steps: usize| p[(i + steps * NOISE_STEP) % n].coords;
+        self.deviations.clear();
+        self.deviations.extend((0..n).step_by(NOISE_STEP).map(|i| {
+            let tangent = at(i, 4) - at(i, 0);
+            let fourth = at(i, 0) + at(i, 4) - (at(i, 1) + at(i, 3)) * 4.0 + at(i, 2) * 6.0;
+            let norm = tangent.norm();
+            if norm > 0.0 { (fourth.perp(&tangent) / norm).abs() } else { fourth.norm() }
+        }));
+        let middle = self.deviations.len() / 2;
+        let (_, median, _) = self.deviations.select_nth_unstable_by(middle, f64::total_cmp);
+        *median / (NORMAL_MAD * FOURTH_DIFFERENCE)
+    }
+}
+
+/// Copies a cutout with a margin of ground where shape touches its rim; gives the margin.
+fn pad(cutout: &Cutout, level: f32, padded: &mut Vec<u8>) -> usize {
+    /// Wide enough for the blur of an aliased picture.
+    const MARGIN: usize = 4;
+    let (width, height) = (cutout.window.width as usize, cutout.window.height as usize);
+    let bright = cutout.shape_level > cutout.ground_level;
+    let inside = |p: &u8| (f32::from(*p) > level) == bright;
+    let rows = || cutout.pixels.chunks_exact(width.max(1));
+    let touches = rows().next().is_some_and(|r| r.iter().any(inside))
+        || rows().next_back().is_some_and(|r| r.iter().any(inside))
+        || rows().any(|r| r.first().is_some_and(inside) || r.last().is_some_and(inside));
+    if !touches {
+        return 0;
+    }
+    let ground = cutout.ground_level.round().clamp(0.0, 255.0) as u8;
+    let padded_width = width + 2 * MARGIN;
+    padded.clear();
+    padded.resize(padded_width * (height + 2 * MARGIN), ground);
+    for (row, to) in rows().zip(padded.chunks_exact_mut(padded_width).skip(MARGIN)) {
+        to[MARGIN..MARGIN + width].copy_from_slice(row);
+    }
+    MARGIN
+}
+
+/// Makes the outermost pixels ground.
+fn fill_rim(pixels: &mut [f32], width: usize, ground: f32) {
+    for (y, row) in pixels.chunks_exact_mut(width).enumerate() {
+        if y == 0 {
+            row.fill(ground);
+        }
+        row[0] = ground;
+        row[width - 1] = ground;
+    }
+    let last = pixels.len().saturating_sub(width);
+    pixels[last..].fill(ground);
+}
+
+/// Blur in pixels that a picture needs before its contour can be trusted.
+fn needed_blur(contrast: f64, slope: f64, noise: f64) -> f64 {
+    let edge_blur = contrast / ((2.0 * std::f64::consts::PI).sqrt() * slope.max(f64::MIN_POSITIVE));
+    let against_aliasing =
+        if edge_blur < MIN_EDGE_BLUR { (EDGE_BLUR * EDGE_BLUR - edge_blur * edge_blur).sqrt() } else { 0.0 };
+    let excess = noise / (contrast * MAX_NOISE_TO_CONTRAST);
+    // A Gaussian of standard deviation s leaves 1 / (2 sqrt(pi) s) of the standard deviation of white noise.
+    let against_noise = if excess > 1.0 { excess / (2.0 * std::f64::consts::PI.sqrt()) } else { 0.0 };
+    // Noise makes edges look sharper than they are; where it is blurred away, there is no aliasing left to fear.
+    if against_noise > 0.0 { against_noise.clamp(MIN_EDGE_BLUR, MAX_BLUR) } else { against_aliasing }
+}
+
+/// Separable Gaussian blur; the picture is continued by its outermost pixels.
+fn gaussian_blur(
+    pixels: &[u8],
+    width: usize,
+    height: usize,
+    sigma: f64,
+    row_buffer: &mut Vec<f32>,
+    out: &mut Vec<f32>,
+) {
+    let reach = (KERNEL_EXTENT * sigma).ceil() as usize;
+    let mut kernel: Vec<f32> =
+        (0..=2 * reach).map(|i| (-(i as f64 - reach as f64).powi(2) / (2.0 * sigma * sigma)).exp() as f32).collect();
+    let total: f32 = kernel.iter().sum();
+    kernel.iter_mut().for_each(|k| *k /= total);
+    out.clear();
+    out.resize(width * height, 0.0);
+    let mut column = vec![0.0f32; width + 2 * reach];
+    row_buffer.clear();
+    row_buffer.resize(width, 0.0);
+    for (y, to) in out.chunks_exact_mut(width).enumerate() {
+        row_buffer.fill(0.0);
+        for (i, k) in kernel.iter().enumerate() {
+            let source = (y + i).saturating_sub(reach).min(height - 1);
+            for (sum, p) in row_buffer.iter_mut().zip(&pixels[source * width..]) {
+                *sum += k * f32::from(*p);
+            }
+        }
+        column[..reach].fill(row_buffer[0]);
+        column[reach..reach + width].copy_from_slice(row_buffer);
+        column[reach + width..].fill(row_buffer[width - 1]);
+        for (i, k) in kernel.iter().enumerate() {
+            for (sum, p) in to.iter_mut().zip(&column[i..]) {
+                *sum += k * p;
+            }
+        }
+    }
+}
+
+/// A grey level.
+trait Grey: Copy {
+    fn level(self) -> f32;
+}
+
+impl Grey for u8 {
+    fn level(self) -> f32 {
+        f32::from(self)
+    }
+}
+
+impl Grey for f32 {
+    fn level(self) -> f32 {
+        self
+    }
+}
+
+/// A picture whose outermost pixels are ground.
+struct Raster<'a, P> {
+    pixels: &'a [P],
+    width: usize,
+    height: usize,
+    level: f32,
+    /// 1 for a shape brighter than the ground, -1 for a darker one.
+    sense: f32,
+}
+
+/// Sides of a marching squares cell.
+#[derive(Clone, Copy, PartialEq)]
+enum Side {
+    Top,
+    Right,
+    Bottom,
+    Left,
+}
+
+impl<P: Grey> Raster<'_, P> {
+    fn is_inside(&self, p: P) -> bool {
+        self.sense * (p.level() - self.level) > 0.0
+    }
+
+    /// Follows the contour that runs up between the pixels `(x - 1, y)` (ground) and `(x, y)` (shape), the shape on its
+    /// right-hand side. Marks the shape pixels to the right of its upward steps. Gives the mean slope of the levels.
+    fn follow(&self, x: usize, y: usize, visited: &mut [bool], contour: &mut Vec<Point>) -> f64 {
+        contour.clear();
+        let value = |x: usize, y: usize| self.sense * (self.pixels[y * self.width + x].level() - self.level);
+        let (start_x, start_y) = (x - 1, y - 1);
+        let (mut x, mut y, mut entry) = (start_x, start_y, Side::Bottom);
+        let mut slopes = 0.0;
+        loop {
+            let (a, b, c, d) = (value(x, y), value(x + 1, y), value(x + 1, y + 1), value(x, y + 1));
+            let corners = u8::from(a > 0.0) | u8::from(b > 0.0) << 1 | u8::from(c > 0.0) << 2 | u8::from(d > 0.0) << 3;
+            let joined = || a + b + c + d > 0.0;
+            let exit = match corners {
+                0b0010 | 0b0110 | 0b1110 => Side::Top,
+                0b0100 | 0b1100 | 0b1101 => Side::Right,
+                0b1000 | 0b1001 | 0b1011 => Side::Bottom,
+                0b0001 | 0b0011 | 0b0111 => Side::Left,
+                0b0101 if (entry == Side::Top) == joined() => Side::Right,
+                0b0101 => Side::Left,
+                _ if (entry == Side::Left) == joined() => Side::Top,
+                _ => Side::Bottom,
+            };
+            let (gx, gy) = (b - a + c - d, d - a + c - b);
+            slopes += f64::from((gx * gx + gy * gy).sqrt() / 2.0);
+            let (fx, fy) = (x as f64, y as f64);
+            let between = |p: f32, q: f32| f64::from(p / (p - q));
+            contour.push(match exit {
+                Side::Top => Point::new(fx + between(a, b), fy),
+                Side::Right => Point::new(fx + 1.0, fy + between(b, c)),
+                Side::Bottom => Point::new(fx + between(d, c), fy + 1.0),
+                Side::Left => Point::new(fx, fy + between(a, d)),
+            });
+            (x, y, entry) = match exit {
+                Side::Top => {
+                    visited[y * self.width + x + 1] = true;
+                    (x, y - 1, Side::Bottom)
+                }
+                Side::Right => (x + 1, y, Side::Left),
+                Side::Bottom => (x, y + 1, Side::Top),
+                Side::Left => (x - 1, y, Side::Right),
+            };
+            if (x, y) == (start_x, start_y) && entry == Side::Bottom {
+                return slopes / contour.len() as f64;
+            }
+        }
+    }
 }

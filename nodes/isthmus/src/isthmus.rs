@@ -1,6 +1,30 @@
 //! Isthmuses: locally shortest chords.
+//!
+//! # Method
+//! After Webster, Ross, LaFollette and Stafford (MVA 1990) an isthmus is a local minimum of the distance value along the
+//! Euclidean skeleton; the isthmus critical points (ICPs) are where its disc touches the border. Found without pixels:
+//! 1. On the Delaunay triangulation of the border ([`Triangulation`]) the distance function of the region has its maxima
+//!    at circumcentres, and its saddles at the middles of those edges that cross their own Voronoi edge (their diametral
+//!    disc is empty: Gabriel edges). Where an edge does not, the way over it is as wide as the narrower of the two discs
+//!    it separates.
+//! 2. *Persistence* (H. Edelsbrunner, D. Letscher, A. Zomorodian, *Topological persistence and simplification*, 2002): going
+//!    through the edges from the widest to the narrowest, each joins two parts of the region (union-find). The part with the
+//!    smaller largest disc ends there; by how much that disc is wider than the edge is the persistence of the isthmus. The
+//!    minima that noise and sampling make along a neck with parallel sides have next to none, and one of them
+//!    stays, the deepest. What lies outside the convex hull counts as one infinitely wide disc.
+//! 3. The chord slides along the border to its shortest, and a quadratic through the squared lengths round it gives both
+//!    ends to a fraction of a step.
+//!
+//! # Cost
+//! `O(n log n)` in the number of border points; the refinement is constant for each isthmus.
+//!
+//! # Failure
+//! Passages narrower than about two steps of the border are not resolved. A bump without a neck has no isthmus.
 
 use crate::Point;
+use crate::contour::Border;
+use crate::skeleton::{NO_NEIGHBOUR, Triangulation};
+use nalgebra::{Matrix6, Vector2, Vector6};
 
 /// On which side of the border an isthmus line runs.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
@@ -32,4 +56,238 @@ pub struct Isthmus {
     pub persistence: f64,
     /// Whether this is taken for a real neck or mouth rather than a shallow waist of the body.
     pub salient: bool,
+}
+
+/// Least persistence in steps of the border: the saddles between the samples of parallel sides have less.
+const MIN_PERSISTENCE_STEPS: f64 = 0.5;
+/// Least persistence in standard deviations of a border point: chance minima of a noisy neck have less (both ends of
+/// both chords vary, and there are many of them).
+const MIN_PERSISTENCE_NOISE: f64 = 6.0;
+/// Least persistence of a salient isthmus, as a part of its width.
+const SALIENT_PERSISTENCE: f64 = 0.04;
+/// Most area beyond the neck of a salient isthmus, as a part of the shape's: a lobe, not half the body.
+const SALIENT_AREA: f64 = 0.2;
+/// How far the chord's ends are tried, in steps, while it slides to its shortest.
+const SLIDE: isize = 3;
+/// Most slides of a chord: far more than a neck is long compared with [`SLIDE`]; guards against pathological borders.
+const MAX_SLIDES: usize = 10_000;
+/// Reach of the quadratic fit round the shortest chord, in steps, on a border without noise.
+const MIN_FIT: f64 = 3.0;
+/// Added to the reach of the fit for each pixel of noise, in steps: the fit averages noise out.
+const FIT_PER_NOISE: f64 = 12.0;
+/// Largest reach of the fit, in steps.
+const MAX_FIT: f64 = 6.0;
+
+/// An edge of the triangulation as a passage between two discs.
+struct Passage {
+    /// Half the width of the passage.
+    radius: f64,
+    /// A side of the triangulation.
+    side: usize,
+}
+
+/// Finds the isthmuses of a border, salient ones first, then by falling persistence. `noise` is the standard deviation of
+/// a border point across the border, in pixels.
+#[must_use]
+pub fn find(border: &Border, triangulation: &Triangulation, noise: f64) -> Vec<Isthmus> {
+    let mut found: Vec<Isthmus> = persistent_saddles(border, triangulation, noise)
+        .into_iter()
+        .filter_map(|(side, persistence)| isthmus_at(border, triangulation, side, persistence, noise))
+        .collect();
+    found.sort_by(|a, b| {
+        b.salient.cmp(&a.salient).then(b.persistence.total_cmp(&a.persistence)).then(a.arc[0].total_cmp(&b.arc[0]))
+    });
+    found
+}
+
+/// The sides of the triangulation that are isthmuses, with their persistence.
+fn persistent_saddles(border: &Border, triangulation: &Triangulation, noise: f64) -> Vec<(usize, f64)> {
+    let n = border.points.len();
+    let outside = triangulation.discs.len();
+    // Discs on (nearly) straight parts of the border have any radius, and rounding differs from one to the next: all that
+    // are larger than the shape count as equally wide.
+    let cap = border.bounds().map_or(f64::INFINITY, |[low, high]| (high - low).norm());
+    let mut passages = Vec::with_capacity(triangulation.corners.len() / 2);
+    for side in 0..triangulation.corners.len() {
+        let neighbour = triangulation.neighbours[side];
+        if neighbour != NO_NEIGHBOUR && neighbour < side {
+            continue;
+        }
+        let (here, there) = (side / 3, if neighbour == NO_NEIGHBOUR { outside } else { neighbour / 3 });
+        let polarity = |t: usize| triangulation.polarity.get(t).copied().unwrap_or(Polarity::Negative);
+        let [i, j] = triangulation.ends(side);
+        let step = i.abs_diff(j);
+        if polarity(here) == polarity(there) && step != 1 && step != n - 1 {
+            passages.push(Passage { radius: passage_radius(border, triangulation, side).min(cap), side });
+        }
+    }
+    passages.sort_unstable_by(|a, b| b.radius.total_cmp(&a.radius).then(a.side.cmp(&b.side)));
+
+    let threshold = (MIN_PERSISTENCE_STEPS * border.spacing).max(MIN_PERSISTENCE_NOISE * noise);
+    let mut regions = Regions::new(triangulation.discs.iter().map(|d| d.distance.min(cap)).chain([f64::INFINITY]));
+    let mut saddles = Vec::new();
+    for Passage { radius, side } in passages {
+        let neighbour = triangulation.neighbours[side];
+        let there = if neighbour == NO_NEIGHBOUR { outside } else { neighbour / 3 };
+        if let Some(largest) = regions.join(side / 3, there) {
+            let persistence = 2.0 * (largest - radius);
+            if persistence > threshold {
+                saddles.push((side, persistence));
+            }
+        }
+    }
+    saddles
+}
+
+/// Half the width of the way over a side of the triangulation.
+fn passage_radius(border: &Border, triangulation: &Triangulation, side: usize) -> f64 {
+    let [i, j] = triangulation.ends(side);
+    let (p, q) = (border.points[i], border.points[j]);
+    let blocked = |side: usize| {
+        // The third corner within the diametral disc: the edge does not cross its Voronoi edge.
+        let third = border.points[triangulation.corners[Triangulation::next_side(Triangulation::next_side(side))]];
+        (p - third).dot(&(q - third)) < 0.0
+    };
+    let neighbour = triangulation.neighbours[side];
+    if blocked(side) || (neighbour != NO_NEIGHBOUR && blocked(neighbour)) {
+        let disc = |side: usize| triangulation.discs[side / 3].distance;
+        if neighbour == NO_NEIGHBOUR { disc(side) } else { disc(side).min(disc(neighbour)) }
+    } else {
+        (q - p).norm() / 2.0
+    }
+}
+
+/// Union-find over discs; each region knows its largest.
+struct Regions {
+    parent: Vec<usize>,
+    largest: Vec<f64>,
+}
+
+impl Regions {
+    fn new(radii: impl Iterator<Item = f64>) -> Self {
+        let largest: Vec<f64> = radii.collect();
+        Self { parent: (0..largest.len()).collect(), largest }
+    }
+
+    fn root(&mut self, mut node: usize) -> usize {
+        while self.parent[node] != node {
+            self.parent[node] = self.parent[self.parent[node]];
+            node = self.parent[node];
+        }
+        node
+    }
+
+    /// Joins the regions of two discs; gives the smaller of their largest radii, or `None` if they were one before.
+    fn join(&mut self, a: usize, b: usize) -> Option<f64> {
+        let (a, b) = (self.root(a), self.root(b));
+        if a == b {
+            return None;
+        }
+        let (small, large) = if self.largest[a] < self.largest[b] { (a, b) } else { (b, a) };
+        self.parent[small] = large;
+        Some(self.largest[small])
+    }
+}
+
+/// The isthmus whose chord is near a side of the triangulation.
+fn isthmus_at(
+    border: &Border,
+    triangulation: &Triangulation,
+    side: usize,
+    persistence: f64,
+    noise: f64,
+) -> Option<Isthmus> {
+    let polarity = triangulation.polarity[side / 3];
+    let [i, j] = triangulation.ends(side);
+    let [s, t] = refine(border, slide(border, [i, j]), noise);
+    let length = border.length();
+    let (s, t) = (s.rem_euclid(length), t.rem_euclid(length));
+    let (p, q) = (border.point_at(s), border.point_at(t));
+    let lobe = lobe_area(border, [s, t]);
+    let area = border.area();
+    let forward = match polarity {
+        Polarity::Positive => border.forward(s, t) <= border.forward(t, s),
+        // Border and chord run round a pocket the other way than round the shape.
+        Polarity::Negative => lobe < 0.0,
+    };
+    let (arc, critical_points, lobe) = if forward { ([s, t], [p, q], lobe) } else { ([t, s], [q, p], area - lobe) };
+    let width = (q - p).norm();
+    let path_length = border.forward(arc[0], arc[1]);
+    if !(width > 0.0 && path_length > width) {
+        return None;
+    }
+    let salient = persistence >= SALIENT_PERSISTENCE * width && lobe.abs() <= SALIENT_AREA * area;
+    Some(Isthmus {
+        polarity,
+        point: nalgebra::center(&p, &q),
+        critical_points,
+        arc,
+        width,
+        path_length,
+        persistence,
+        salient,
+    })
+}
+
+/// Slides both ends of a chord along the border until no shorter one is near.
+fn slide(border: &Border, ends: [usize; 2]) -> [usize; 2] {
+    let n = border.points.len();
+    let moved = |i: usize, by: isize| (i as isize + by).rem_euclid(n as isize) as usize;
+    let squared = |i: usize, j: usize| (border.points[i] - border.points[j]).norm_squared();
+    let mut best = (squared(ends[0], ends[1]), ends);
+    for _ in 0..MAX_SLIDES {
+        let [i, j] = best.1;
+        for a in -SLIDE..=SLIDE {
+            for b in -SLIDE..=SLIDE {
+                let (i, j) = (moved(i, a), moved(j, b));
+                let length = squared(i, j);
+                if length < best.0 && i.abs_diff(j) > 1 {
+                    best = (length, [i, j]);
+                }
+            }
+        }
+        if best.1 == [i, j] {
+            break;
+        }
+    }
+    best.1
+}
+
+/// Arc lengths of the ends of the shortest chord near a chord between border points: the minimum of a quadratic fitted to
+/// the squared chord lengths round it.
+fn refine(border: &Border, [i, j]: [usize; 2], noise: f64) -> [f64; 2] {
+    let n = border.points.len() as isize;
+    let at = |i: isize| border.points[i.rem_euclid(n) as usize];
+    let start = [i as f64 * border.spacing, j as f64 * border.spacing];
+    let apart = i.abs_diff(j).min(border.points.len() - i.abs_diff(j));
+    let reach = (MIN_FIT + FIT_PER_NOISE * noise).min(MAX_FIT).min(apart as f64 / 3.0).round() as isize;
+    let mut normal = Matrix6::zeros();
+    let mut right = Vector6::zeros();
+    for a in -reach..=reach {
+        for b in -reach..=reach {
+            let (u, v) = (a as f64, b as f64);
+            let row = Vector6::new(1.0, u, v, u * u, u * v, v * v);
+            let value = (at(i as isize + a) - at(j as isize + b)).norm_squared();
+            normal += row * row.transpose();
+            right += row * value;
+        }
+    }
+    let Some(fit) = normal.cholesky().map(|c| c.solve(&right)) else { return start };
+    let (fu, fv, fuu, fuv, fvv) = (fit[1], fit[2], 2.0 * fit[3], fit[4], 2.0 * fit[5]);
+    let determinant = fuu * fvv - fuv * fuv;
+    let shift = Vector2::new(fuv * fv - fvv * fu, fuv * fu - fuu * fv) / determinant;
+    // Where the sides are parallel the fit has no minimum of its own, or one far away: then the shortest chord stays.
+    if fuu > 0.0 && determinant > 0.0 && shift.amax() <= reach as f64 {
+        [start[0] + shift.x * border.spacing, start[1] + shift.y * border.spacing]
+    } else {
+        start
+    }
+}
+
+/// Signed area between the border from `arc[0]` forward to `arc[1]` and the chord back.
+fn lobe_area(border: &Border, arc: [f64; 2]) -> f64 {
+    let count = (border.forward(arc[0], arc[1]) / border.spacing).ceil() as usize + 1;
+    let points = border.sample(arc, 0.0, count);
+    let Some(&origin) = points.first() else { return 0.0 };
+    points.windows(2).map(|w| (w[0] - origin).perp(&(w[1] - origin))).sum::<f64>() / 2.0
 }

@@ -36,3 +36,60 @@ pub struct Features {
     /// Skeleton outside the shape, bounded by the area of interest.
     pub exoskeleton: skeleton::Skeleton,
 }
+
+/// Why a shape has no features.
+#[derive(Debug, Clone, PartialEq, thiserror::Error)]
+#[non_exhaustive]
+pub enum Error {
+    /// No border.
+    #[error(transparent)]
+    Contour(#[from] contour::ContourError),
+    /// No triangulation.
+    #[error(transparent)]
+    Triangulation(#[from] skeleton::TriangulationError),
+}
+
+impl Features {
+    /// Features of a border. `noise` is the standard deviation of a border point across the border, in pixels (0 for an
+    /// outline that is exact).
+    ///
+    /// # Errors
+    /// [`Error`] where the border spans no triangle.
+    pub fn from_border(border: contour::Border, noise: f64) -> Result<Self, Error> {
+        Extractor::default().analyse(border, noise)
+    }
+}
+
+/// Extracts features, keeping its buffers from one shape to the next.
+#[derive(Debug, Clone, Default)]
+pub struct Extractor {
+    tracer: contour::Tracer,
+    triangulation: skeleton::Triangulation,
+}
+
+impl Extractor {
+    /// Features of a cutout.
+    ///
+    /// # Errors
+    /// [`Error`] where the cutout is inconsistent or shows no shape.
+    pub fn extract(&mut self, cutout: &mask::Cutout) -> Result<Features, Error> {
+        let (border, noise) = self.tracer.trace(cutout)?;
+        self.analyse(border, noise)
+    }
+
+    /// Features of a border, as [`Features::from_border`].
+    ///
+    /// # Errors
+    /// [`Error`] where the border spans no triangle.
+    pub fn analyse(&mut self, border: contour::Border, noise: f64) -> Result<Features, Error> {
+        self.triangulation.rebuild(&border)?;
+        let isthmuses = isthmus::find(&border, &self.triangulation, noise);
+        Ok(Features {
+            border,
+            noise,
+            isthmuses,
+            endoskeleton: skeleton::Skeleton::default(),
+            exoskeleton: skeleton::Skeleton::default(),
+        })
+    }
+}

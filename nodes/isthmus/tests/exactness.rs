@@ -1,0 +1,100 @@
+//! Necks that are known exactly are found, at the right place, on outlines and in pictures.
+
+mod shapes;
+
+use isthmus::isthmus::Isthmus;
+use isthmus::{Extractor, Features, contour::Border};
+use shapes::{Camera, Neck, Piece, pose};
+
+/// A found isthmus belongs to the true one whose middle is this near, in pixels.
+const SAME: f64 = 4.0;
+
+fn nearest<'a>(features: &'a Features, neck: &Neck) -> Option<&'a Isthmus> {
+    features
+        .isthmuses
+        .iter()
+        .filter(|i| i.polarity == neck.polarity)
+        .min_by(|a, b| (a.point - neck.middle()).norm().total_cmp(&(b.point - neck.middle()).norm()))
+        .filter(|i| (i.point - neck.middle()).norm() < SAME)
+}
+
+/// What is measured on many pieces.
+#[derive(Debug, Default)]
+struct Score {
+    pieces: usize,
+    true_necks: usize,
+    missed: usize,
+    not_salient: usize,
+    superfluous: [usize; 2],
+    superfluous_salient: [usize; 2],
+    middle: Vec<f64>,
+    ends: Vec<f64>,
+}
+
+impl Score {
+    fn add(&mut self, features: &Features, necks: &[Neck]) {
+        self.pieces += 1;
+        self.true_necks += necks.len();
+        let mut used = Vec::new();
+        for neck in necks {
+            let Some(found) = nearest(features, neck) else {
+                self.missed += 1;
+                continue;
+            };
+            self.not_salient += usize::from(!found.salient);
+            used.push(found.point);
+            self.middle.push((found.point - neck.middle()).norm());
+            let end = |p: isthmus::Point| neck.ends.iter().map(|q| (p - q).norm()).fold(f64::MAX, f64::min);
+            self.ends.extend(found.critical_points.map(end));
+        }
+        for i in features.isthmuses.iter().filter(|i| !used.contains(&i.point)) {
+            self.superfluous[i.polarity as usize] += 1;
+            self.superfluous_salient[i.polarity as usize] += usize::from(i.salient);
+        }
+    }
+
+    fn summary(&mut self) -> String {
+        let quantiles = |v: &mut Vec<f64>| {
+            v.sort_by(f64::total_cmp);
+            let at = |q: f64| v.get(((v.len() - 1) as f64 * q) as usize).copied().unwrap_or(f64::NAN);
+            [at(0.5), at(0.95), at(1.0)]
+        };
+        let (middle, ends) = (quantiles(&mut self.middle), quantiles(&mut self.ends));
+        format!(
+            "{} pieces, {} necks, missed {}, not salient {}, superfluous {:?} (salient {:?}), middle {middle:.3?}, ends {ends:.3?}",
+            self.pieces, self.true_necks, self.missed, self.not_salient, self.superfluous, self.superfluous_salient
+        )
+    }
+}
+
+#[test]
+fn outlines() {
+    let mut score = Score::default();
+    for seed in 0..40 {
+        let piece = Piece::random(300.0, seed);
+        let pose = pose(seed as f64 * 0.7, 1.0, 256.3, 255.6);
+        let features = Features::from_border(Border::from_points(&piece.outline(&pose)).unwrap(), 0.0).unwrap();
+        score.add(&features, &piece.necks(&pose));
+    }
+    let summary = score.summary();
+    println!("{summary}");
+    assert_eq!((score.missed, score.not_salient), (0, 0), "{summary}");
+}
+
+#[test]
+fn pictures() {
+    for (noise, blur) in [(0.0, 0.8), (10.0, 1.0), (20.0, 1.0), (20.0, 4.0), (40.0, 1.0), (40.0, 4.0)] {
+        let mut score = Score::default();
+        let mut extractor = Extractor::default();
+        for seed in 0..20 {
+            let piece = Piece::random(250.0, seed);
+            let pose = pose(seed as f64 * 0.7, 1.0, 256.3, 255.6);
+            let camera = Camera { noise, blur, seed, ..Camera::default() };
+            let features = extractor.extract(&camera.cutout(&piece.outline(&pose))).unwrap();
+            score.add(&features, &piece.necks(&pose));
+        }
+        let summary = score.summary();
+        println!("noise {noise} blur {blur}: {summary}");
+        assert_eq!((score.missed, score.not_salient), (0, 0), "noise {noise} blur {blur}: {summary}");
+    }
+}
