@@ -2,6 +2,8 @@
 //!
 //! Coordinates are pixels: x right, y **down**. Transforms are `target_from_source`.
 
+pub mod generate;
+
 use nalgebra::Isometry2;
 
 pub mod params;
