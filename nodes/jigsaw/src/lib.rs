@@ -6,7 +6,15 @@ pub mod generate;
 
 use nalgebra::Isometry2;
 
+pub mod correlation;
+mod frame;
+mod index;
+mod loops;
+mod outline;
 pub mod params;
+pub mod placement;
+mod posegraph;
+mod search;
 pub mod solver;
 
 pub use params::{Params, ParamsError, Policy};

@@ -1,9 +1,23 @@
 //! The incremental solver: pieces come and go, candidates are kept, a solution is made on demand.
 
-use crate::{Assembly, Params, ParamsError, Piece};
+use crate::correlation::correlate;
+use crate::index::{Entry, Hit, Index, Windows};
+use crate::outline::{Outline, Segment};
+use crate::search::{self, Joint, Outcome};
+use crate::{Assembly, Mating, Params, ParamsError, Piece, Placement, TableCounts, Timings, frame, placement};
 use nalgebra::Isometry2;
+use rayon::prelude::*;
 use std::collections::HashMap;
+use std::sync::Arc;
+use std::time::{Duration, Instant};
 use thiserror::Error;
+
+/// Window on the difference of mouth and neck width, in piece scales: clearance on both sides (3 % each) and the
+/// uncertainty of a flat minimum on both.
+const OPENING_WINDOW: f64 = 0.15;
+/// Window on the difference of path lengths, in piece scales: the critical points of a neck with near-parallel sides
+/// may slide along it.
+const PATH_WINDOW: f64 = 0.4;
 
 /// A rule that drops a candidate.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, serde::Serialize)]
@@ -88,14 +102,34 @@ pub enum SolverError {
         /// How many points its border has.
         points: usize,
     },
+    /// The threads asked for can't be started.
+    #[error("cannot start {threads} threads: {reason}")]
+    Threads {
+        /// How many.
+        threads: usize,
+        /// What the system says.
+        reason: String,
+    },
 }
 
-/// The solver.
+/// A tab that may fit a mouth.
+#[derive(Debug, Clone, Copy)]
+struct Match {
+    hit: Hit,
+    /// `None` where the refinement failed: the two don't fit at all.
+    fit: Option<placement::Fit>,
+}
+
+/// The solver. Pieces are taken in one by one; [`Solver::solve`] matches what is new and assembles all.
 #[derive(Debug, Clone)]
 pub struct Solver {
     params: Params,
+    pool: Option<Arc<rayon::ThreadPool>>,
     pieces: Vec<Piece>,
     index_of: HashMap<String, usize>,
+    outlines: Vec<Option<Outline>>,
+    /// For each piece and mouth the nearest tabs; `None` where they have to be looked for.
+    matches: Vec<Option<Vec<Vec<Match>>>>,
     candidates: Vec<Candidate>,
 }
 
@@ -106,10 +140,27 @@ impl Solver {
     /// An empty solver.
     ///
     /// # Errors
-    /// A parameter out of range.
-    pub fn new(params: Params) -> Result<Self, ParamsError> {
+    /// A parameter out of range; threads that can't be started.
+    pub fn new(params: Params) -> Result<Self, SolverError> {
         params.validate()?;
-        Ok(Self { params, pieces: Vec::new(), index_of: HashMap::new(), candidates: Vec::new() })
+        let pool = match params.threads {
+            0 => None,
+            threads => Some(Arc::new(
+                rayon::ThreadPoolBuilder::new()
+                    .num_threads(threads)
+                    .build()
+                    .map_err(|e| SolverError::Threads { threads, reason: e.to_string() })?,
+            )),
+        };
+        Ok(Self {
+            params,
+            pool,
+            pieces: Vec::new(),
+            index_of: HashMap::new(),
+            outlines: Vec::new(),
+            matches: Vec::new(),
+            candidates: Vec::new(),
+        })
     }
 
     /// The parameters in force.
@@ -127,7 +178,7 @@ impl Solver {
         &self.candidates
     }
 
-    /// Takes a piece in and returns its index. Computes only what the new piece brings.
+    /// Takes a piece in and returns its index. What it brings is matched by the next [`Solver::solve`].
     ///
     /// # Errors
     /// The id is taken, or the border is no border.
@@ -135,13 +186,16 @@ impl Solver {
         if self.index_of.contains_key(&piece.id) {
             return Err(SolverError::DuplicateId(piece.id));
         }
-        let points = &piece.features.border.points;
-        if points.len() < Self::MIN_BORDER_POINTS || points.iter().any(|p| !(p.x.is_finite() && p.y.is_finite())) {
-            return Err(SolverError::Border { points: points.len(), id: piece.id });
+        let border = &piece.features.border;
+        let finite = border.spacing.is_finite() && border.points.iter().all(|p| p.x.is_finite() && p.y.is_finite());
+        if border.points.len() < Self::MIN_BORDER_POINTS || border.spacing <= 0.0 || !finite {
+            return Err(SolverError::Border { points: border.points.len(), id: piece.id });
         }
         let index = self.pieces.len();
         self.index_of.insert(piece.id.clone(), index);
         self.pieces.push(piece);
+        self.outlines.push(None);
+        self.matches.push(None);
         Ok(index)
     }
 
@@ -151,6 +205,20 @@ impl Solver {
         for other in self.index_of.values_mut().filter(|other| **other > index) {
             *other -= 1;
         }
+        self.outlines.remove(index);
+        self.matches.remove(index);
+        for lists in &mut self.matches {
+            // A mouth that loses a candidate may gain the next best one: it is looked for again.
+            if lists.iter().flatten().flatten().any(|m| m.hit.piece as usize == index) {
+                *lists = None;
+            }
+            for m in lists.iter_mut().flatten().flatten() {
+                if m.hit.piece as usize > index {
+                    m.hit.piece -= 1;
+                }
+            }
+        }
+        self.candidates.clear();
         Some(self.pieces.remove(index))
     }
 
@@ -158,13 +226,253 @@ impl Solver {
     pub fn reset(&mut self) {
         self.pieces.clear();
         self.index_of.clear();
+        self.outlines.clear();
+        self.matches.clear();
         self.candidates.clear();
     }
 
     /// The best assembly of the pieces that are there.
     pub fn solve(&mut self) -> Assembly {
-        Assembly { unplaced: (0..self.pieces.len()).collect(), ..Assembly::default() }
+        match self.pool.clone() {
+            Some(pool) => pool.install(|| self.solve_here()),
+            None => self.solve_here(),
+        }
     }
+
+    fn solve_here(&mut self) -> Assembly {
+        let begin = Instant::now();
+        let deadline =
+            (self.params.time_budget > 0.0).then(|| begin + Duration::from_secs_f64(self.params.time_budget));
+        // Ranks by id make the result independent of the order of insertion.
+        let mut order: Vec<usize> = (0..self.pieces.len()).collect();
+        order.sort_by(|p, q| self.pieces[*p].id.cmp(&self.pieces[*q].id));
+        let mut rank = vec![0; order.len()];
+        for (r, k) in order.iter().enumerate() {
+            rank[*k] = r;
+        }
+        let pieces = &self.pieces;
+        self.outlines.par_iter_mut().enumerate().for_each(|(k, outline)| {
+            outline.get_or_insert_with(|| Outline::new(&pieces[k]));
+        });
+        self.match_new(&rank);
+        let (joints, places) = self.joints(&order, &rank);
+        let matched = Instant::now();
+        let outlines: Vec<&Outline> = order.iter().filter_map(|k| self.outlines[*k].as_ref()).collect();
+        let outcome = search::assemble(&outlines, &joints, &self.params, deadline);
+        let mut assembly = self.report(&order, &outlines, &joints, &outcome);
+        self.explain(&joints, &places, &outcome, &order);
+        assembly.table = self.count(&joints, &outcome);
+        assembly.partial = outcome.partial;
+        assembly.timings =
+            Timings { matching: (matched - begin).as_secs_f64(), assembly: matched.elapsed().as_secs_f64() };
+        assembly
+    }
+
+    /// Finds the candidates of new mouths among all tabs, and of old mouths among the new tabs.
+    fn match_new(&mut self, rank: &[usize]) {
+        let fresh: Vec<usize> = (0..self.pieces.len()).filter(|k| self.matches[*k].is_none()).collect();
+        if fresh.is_empty() {
+            return;
+        }
+        let outlines: Vec<&Outline> = self.outlines.iter().flatten().collect();
+        let entries = |pieces: &[usize]| -> Vec<Entry> {
+            let mut entries = Vec::new();
+            for &piece in pieces {
+                entries.extend(outlines[piece].tabs.iter().enumerate().map(|(tab, segment)| Entry {
+                    piece: piece as u32,
+                    tab: tab as u32,
+                    rank: rank[piece] as u32,
+                    segment,
+                }));
+            }
+            entries
+        };
+        let everything: Vec<usize> = (0..outlines.len()).collect();
+        let all = Index::new(entries(&everything));
+        let new = Index::new(entries(&fresh));
+        let keep = self.params.candidates;
+        let free = self.params.fit_clearance;
+        self.matches.par_iter_mut().enumerate().for_each(|(piece, lists)| {
+            let outline = outlines[piece];
+            let index = if lists.is_none() { &all } else { &new };
+            let lists = lists.get_or_insert_with(|| vec![Vec::new(); outline.mouths.len()]);
+            for (mouth, list) in outline.mouths.iter().zip(lists) {
+                for hit in index.nearest(mouth, piece as u32, &windows(outline), keep) {
+                    let place = list.partition_point(|m: &Match| m.hit.order(&hit).is_lt());
+                    let known = list.get(place).is_some_and(|m| (m.hit.piece, m.hit.tab) == (hit.piece, hit.tab));
+                    if place >= keep || known {
+                        continue;
+                    }
+                    let tab = &outlines[hit.piece as usize].tabs[hit.tab as usize];
+                    let fit = placement::fit(tab, mouth, outline.scale, free);
+                    list.insert(place, Match { hit, fit });
+                    list.truncate(keep);
+                }
+            }
+        });
+    }
+
+    /// The candidates that could be refined, in ranks; and where each came from (piece, mouth, place in the list).
+    fn joints(&self, order: &[usize], rank: &[usize]) -> (Vec<Joint>, Vec<[usize; 3]>) {
+        let mut joints = Vec::new();
+        let mut places = Vec::new();
+        for &piece in order {
+            for (mouth, list) in self.matches[piece].iter().flatten().enumerate() {
+                for (place, m) in list.iter().enumerate() {
+                    let Some(fit) = m.fit else { continue };
+                    let (a, b) = (rank[m.hit.piece as usize], rank[piece]);
+                    joints.push(Joint { a, tab: m.hit.tab as usize, b, mouth, fit });
+                    places.push([piece, mouth, place]);
+                }
+            }
+        }
+        (joints, places)
+    }
+
+    fn report(&self, order: &[usize], outlines: &[&Outline], joints: &[Joint], outcome: &Outcome) -> Assembly {
+        let mut islands: std::collections::BTreeMap<usize, Vec<usize>> = std::collections::BTreeMap::new();
+        for (k, pose) in outcome.poses.iter().enumerate() {
+            if let Some((island, _)) = pose {
+                islands.entry(*island).or_default().push(k);
+            }
+        }
+        let mut islands: Vec<Vec<usize>> = islands.into_values().collect();
+        islands.sort_by(|p, q| q.len().cmp(&p.len()).then(p.cmp(q)));
+        let poses: Vec<Isometry2<f64>> =
+            outcome.poses.iter().map(|p| p.map_or_else(Isometry2::identity, |p| p.1)).collect();
+        let mut assembly = Assembly::default();
+        let mut placed = vec![false; order.len()];
+        for (component, (members, motion)) in frame::lay_out(outlines, &poses, &islands).into_iter().enumerate() {
+            for k in members {
+                placed[k] = true;
+                assembly.placements.push(Placement {
+                    piece: order[k],
+                    puzzle_from_image: motion * poses[k],
+                    component,
+                    confidence: outcome.confidence[k],
+                });
+            }
+        }
+        assembly.unplaced = (0..order.len()).filter(|k| !placed[*k]).map(|k| order[k]).collect();
+        for (k, confidence) in &outcome.matings {
+            let j = &joints[*k];
+            let (tab, mouth) = (&outlines[j.a].tabs[j.tab], &outlines[j.b].mouths[j.mouth]);
+            assembly.matings.push(Mating {
+                positive_piece: order[j.a],
+                positive_isthmus: tab.isthmus,
+                negative_piece: order[j.b],
+                negative_isthmus: mouth.isthmus,
+                correlation: correlation_of(tab, mouth),
+                ave_gap: j.fit.ave_gap,
+                clearance: j.fit.clearance,
+                confidence: *confidence,
+            });
+        }
+        assembly
+    }
+
+    /// The candidate table with what became of each.
+    fn explain(&mut self, joints: &[Joint], places: &[[usize; 3]], outcome: &Outcome, order: &[usize]) {
+        let mut mated = vec![false; joints.len()];
+        let mut taken = std::collections::HashSet::new();
+        for (k, _) in &outcome.matings {
+            mated[*k] = true;
+            let j = &joints[*k];
+            taken.insert((true, j.a, j.tab));
+            taken.insert((false, j.b, j.mouth));
+        }
+        let pieces: Vec<&Outline> = self.outlines.iter().flatten().collect();
+        let matches = &self.matches;
+        self.candidates = joints
+            .par_iter()
+            .enumerate()
+            .map(|(k, j)| {
+                let scale = pieces[order[j.b]].scale;
+                let (tab, mouth) = (&pieces[order[j.a]].tabs[j.tab], &pieces[order[j.b]].mouths[j.mouth]);
+                let rival = taken.contains(&(true, j.a, j.tab)) || taken.contains(&(false, j.b, j.mouth));
+                let fate = if mated[k] {
+                    Fate::Mated
+                } else if j.fit.residual > HOPELESS * placement::RESIDUAL_CAP * scale {
+                    Fate::Dropped(Rule::Overlap)
+                } else if rival {
+                    Fate::Dropped(Rule::Rival)
+                } else {
+                    Fate::Dropped(Rule::Support)
+                };
+                let [piece, list, place] = places[k];
+                let hit = matches[piece].as_ref().map(|lists| lists[list][place].hit);
+                Candidate {
+                    positive_piece: order[j.a],
+                    positive_isthmus: tab.isthmus,
+                    negative_piece: order[j.b],
+                    negative_isthmus: mouth.isthmus,
+                    opening: mouth.width - tab.width,
+                    path_difference: mouth.path - tab.path,
+                    shape_distance: hit.map_or(f64::INFINITY, |h| f64::from(h.distance)),
+                    correlation: correlation_of(tab, mouth),
+                    pos_gap: j.fit.pos_gap,
+                    neg_gap: j.fit.neg_gap,
+                    ave_gap: j.fit.ave_gap,
+                    clearance: j.fit.clearance,
+                    support: outcome.support[k],
+                    negative_from_positive: j.fit.negative_from_positive,
+                    fate,
+                }
+            })
+            .collect();
+    }
+
+    /// Counts of the candidate table: windows counted on sorted widths, the rest on the candidates themselves.
+    fn count(&self, joints: &[Joint], outcome: &Outcome) -> TableCounts {
+        let outlines: Vec<&Outline> = self.outlines.iter().flatten().collect();
+        let mut tabs: Vec<(f64, f64)> =
+            outlines.iter().flat_map(|o| o.tabs.iter().map(|t| (t.width, t.path))).collect();
+        tabs.sort_by(|p, q| p.0.total_cmp(&q.0));
+        let negative: usize = outlines.iter().map(|o| o.mouths.len()).sum();
+        let same: usize = outlines.iter().map(|o| o.mouths.len() * o.tabs.len()).sum();
+        let within = |v: f64, w: (f64, f64)| v >= w.0 && v <= w.1;
+        let (after_opening, after_length) = outlines
+            .par_iter()
+            .map(|o| {
+                let w = windows(o);
+                let (mut opening, mut length) = (0, 0);
+                for m in &o.mouths {
+                    let from = tabs.partition_point(|t| m.width - t.0 > w.opening.1);
+                    let to = tabs.partition_point(|t| m.width - t.0 >= w.opening.0);
+                    let own: Vec<&Segment> = o.tabs.iter().filter(|t| within(m.width - t.width, w.opening)).collect();
+                    opening += (to - from) - own.len();
+                    length += tabs[from..to].iter().filter(|t| within(m.path - t.1, w.path)).count()
+                        - own.iter().filter(|t| within(m.path - t.path, w.path)).count();
+                }
+                (opening, length)
+            })
+            .reduce(|| (0, 0), |p, q| (p.0 + q.0, p.1 + q.1));
+        let overlapping = self.candidates.iter().filter(|c| c.fate == Fate::Dropped(Rule::Overlap)).count();
+        TableCounts {
+            positive: tabs.len(),
+            negative,
+            pairs: tabs.len() * negative - same,
+            after_opening,
+            after_length,
+            after_correlation: joints.len(),
+            after_overlap: joints.len() - overlapping,
+            backtracks: outcome.backtracks,
+        }
+    }
+}
+
+/// A mean residual above this part of the cap means that the borders don't follow each other at all.
+const HOPELESS: f64 = 0.5;
+
+/// Eq. 1 of a tab and a mouth.
+fn correlation_of(tab: &Segment, mouth: &Segment) -> f64 {
+    let samples = |s: &Segment| s.shape.iter().map(|v| f64::from(*v)).collect::<Vec<f64>>();
+    correlate(&samples(tab), &samples(mouth), 0.75, 8).value
+}
+
+fn windows(outline: &Outline) -> Windows {
+    let (w, p) = (OPENING_WINDOW * outline.scale, PATH_WINDOW * outline.scale);
+    Windows { opening: (-w, w), path: (-p, p) }
 }
 
 /// Assembles a whole set of pieces at once; indices in the result point into `pieces`.

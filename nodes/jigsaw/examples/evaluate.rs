@@ -1,0 +1,166 @@
+//! How well the solver does on generated puzzles: one line for each case and seed.
+//!
+//! `cargo run --release -p jigsaw --example evaluate -- [CASE…] [--seeds FROM..TO] [--off SWITCH]`
+//! where a case is one of those listed by `--list`, and a switch is one of loops, pose_graph, fit_clearance,
+//! recalibrate, merge_islands.
+
+use anyhow::{Context, bail};
+use jigsaw::generate::{Cut, Options, Puzzle, Rim};
+use jigsaw::{Params, Piece, Solver};
+use rayon::prelude::*;
+use std::time::Instant;
+
+/// A case: its name, how its puzzle is made, and whether its features come from rendered frames or from the outlines.
+struct Case {
+    name: &'static str,
+    options: Options,
+    frames: bool,
+}
+
+fn cases() -> Vec<Case> {
+    let grid = |rows, columns| Options { rows, columns, ..Options::default() };
+    let small = |rows, columns| Options { frame: Some([512, 512]), ..grid(rows, columns) };
+    let case = |name, options| Case { name, options, frames: true };
+    let exact = |name, options| Case { name, options, frames: false };
+    let worn = Options { noise: 20.0, blur: 4.0, vignette: 0.5, ..grid(4, 6) };
+    vec![
+        exact("exact4x6", grid(4, 6)),
+        case("4x6", grid(4, 6)),
+        case("3x8", grid(3, 8)),
+        case("8x12", grid(8, 12)),
+        case("worn0", worn.clone()),
+        case("worn2", Options { clearance: [2.0, 2.0], ..worn.clone() }),
+        case("worn04", Options { clearance: [0.0, 4.0], ..worn }),
+        case("alike95", Options { similarity: 0.95, noise: 10.0, blur: 2.0, ..grid(4, 6) }),
+        case("alike98", Options { similarity: 0.98, ..grid(4, 6) }),
+        case("alike98_8x12", Options { similarity: 0.98, ..small(8, 12) }),
+        case("missing3", Options { missing: 3, ..grid(4, 6) }),
+        case("missing5", Options { missing: 5, ..grid(4, 6) }),
+        case("twice3", Options { duplicate: 3, ..grid(4, 6) }),
+        case("flipped3", Options { flipped: 3, ..grid(4, 6) }),
+        case("mixed", Options { puzzles: 2, ..grid(4, 6) }),
+        case("wavy", Options { wavy: 0.1, ..grid(4, 6) }),
+        case("wavy_8x12", Options { wavy: 0.1, ..small(8, 12) }),
+        case("patch", Options { rim: Rim::Patch, ..grid(4, 6) }),
+        case("ragged", Options { rim: Rim::Ragged, ..grid(6, 8) }),
+        case("brick", Options { cut: Cut::Brick, ..grid(5, 6) }),
+        case("honeycomb", Options { cut: Cut::Honeycomb, ..grid(5, 6) }),
+        case("strip", Options { wavy: 0.0, ..grid(1, 6) }),
+        case("15x20", small(15, 20)),
+        case("25x40", small(25, 40)),
+        exact("exact25x40", small(25, 40)),
+        exact("exact100x100", small(100, 100)),
+    ]
+}
+
+/// Pieces from rendered frames (or straight from the outlines).
+fn pieces(puzzle: &Puzzle, frames: bool) -> anyhow::Result<Vec<Piece>> {
+    (0..puzzle.pieces().len())
+        .into_par_iter()
+        .map(|k| {
+            let id = puzzle.pieces()[k].id.clone();
+            let features = if frames {
+                isthmus::Extractor::default().extract(&cutout(puzzle, k))
+            } else {
+                isthmus::Features::from_border(puzzle.border(k, 1.0), 0.0)
+            };
+            Ok(Piece { features: features.with_context(|| format!("piece {id}"))?, id })
+        })
+        .collect()
+}
+
+fn cutout(puzzle: &Puzzle, k: usize) -> isthmus::mask::Cutout {
+    let frame = puzzle.render(puzzle.pieces()[k].frame);
+    let whole = isthmus::mask::Aoi { x: 0, y: 0, width: frame.width, height: frame.height };
+    let mut shape: Vec<u8> = frame.pixels.iter().copied().filter(|p| *p < 100).collect();
+    let mut ground: Vec<u8> = frame.pixels.iter().copied().filter(|p| *p >= 100).collect();
+    shape.sort_unstable();
+    ground.sort_unstable();
+    isthmus::mask::Cutout {
+        aoi: whole,
+        window: whole,
+        pixels: frame.pixels,
+        shape_level: f32::from(shape[shape.len() / 2]),
+        ground_level: f32::from(ground[ground.len() / 2]),
+        noise_level: puzzle.options().noise as f32,
+    }
+}
+
+fn main() -> anyhow::Result<()> {
+    let mut names = Vec::new();
+    let mut seeds = 1..4u64;
+    let mut params = Params::default();
+    let mut arguments = std::env::args().skip(1);
+    let cases = cases();
+    while let Some(argument) = arguments.next() {
+        match argument.as_str() {
+            "--list" => {
+                cases.iter().for_each(|c| println!("{}", c.name));
+                return Ok(());
+            }
+            "--seeds" => {
+                let range = arguments.next().context("--seeds wants FROM..TO")?;
+                let (from, to) = range.split_once("..").context("--seeds wants FROM..TO")?;
+                seeds = from.parse()?..to.parse()?;
+            }
+            "--off" => match arguments.next().as_deref() {
+                Some("loops") => params.loops = false,
+                Some("pose_graph") => params.pose_graph = false,
+                Some("fit_clearance") => params.fit_clearance = false,
+                Some("recalibrate") => params.recalibrate = false,
+                Some("merge_islands") => params.merge_islands = false,
+                other => bail!("unknown switch {other:?}"),
+            },
+            name => names.push(name.to_owned()),
+        }
+    }
+    println!(
+        "{:14} {:>4} {:>9} {:>5} {:>11} {:>5} {:>8} {:>8} {:>8} {:>7} {:>7} {:>5}",
+        "case",
+        "seed",
+        "placed",
+        "misp",
+        "matings",
+        "wrong",
+        "worst px",
+        "rot mrad",
+        "clear px",
+        "match",
+        "asm",
+        "back"
+    );
+    for case in cases.iter().filter(|c| names.is_empty() || names.iter().any(|n| n == c.name)) {
+        for seed in seeds.clone() {
+            let puzzle = Puzzle::generate(&Options { seed, ..case.options.clone() })?;
+            let begin = Instant::now();
+            let pieces = pieces(&puzzle, case.frames)?;
+            let features = begin.elapsed().as_secs_f64();
+            let mut solver = Solver::new(params)?;
+            for piece in &pieces {
+                solver.insert(piece.clone())?;
+            }
+            let assembly = solver.solve();
+            let s = puzzle.score(&pieces, &assembly);
+            println!(
+                "{:14} {:4} {:4}/{:4} {:5} {:5}/{:5} {:5} {:8.3} {:8.3} {:8.3} {:7.3} {:7.3} {:5} {}{:.1}",
+                case.name,
+                seed,
+                s.placed,
+                s.pieces,
+                s.misplaced,
+                s.right_matings,
+                s.joints,
+                s.wrong_matings,
+                s.worst_offset,
+                1e3 * s.worst_rotation,
+                s.worst_clearance,
+                assembly.timings.matching,
+                assembly.timings.assembly,
+                assembly.table.backtracks,
+                if s.is_perfect() { "" } else { "<<< " },
+                features,
+            );
+        }
+    }
+    Ok(())
+}

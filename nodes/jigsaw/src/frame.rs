@@ -1,0 +1,142 @@
+//! The puzzle frame: which way up an assembly lies, and where.
+//!
+//! An assembly is known up to a rigid motion. The gauge: straight edges of the outline lie along the axes (the
+//! direction most of their length agrees on); without enough of them, the rectangle of least area about the convex
+//! hull does (Freeman and Shapira 1975: one side lies on a hull edge). The long side runs along x; of the turns that
+//! are left (half or quarter), the one that turns the first piece least. Top left of the bounding box at the origin;
+//! further assemblies stand to the right of it, a piece's width apart.
+
+use crate::outline::Outline;
+use isthmus::Point;
+use nalgebra::{Isometry2, Translation2, UnitComplex, Vector2};
+use std::f64::consts::{FRAC_PI_2, PI};
+
+/// Straight edges decide if their length is at least this part of half the hull's perimeter.
+const STRAIGHT_SHARE: f64 = 0.5;
+/// Straight edges within this angle (radians) of the common direction count for it.
+const STRAIGHT_SPREAD: f64 = 0.03;
+/// Sides that differ by less than this fraction count as a square, which may be turned by quarters.
+const SQUARE: f64 = 0.02;
+
+/// Motions of the islands (lists of pieces, largest first) from their own frame to the puzzle frame.
+pub(crate) fn lay_out(
+    outlines: &[&Outline],
+    poses: &[Isometry2<f64>],
+    islands: &[Vec<usize>],
+) -> Vec<(Vec<usize>, Isometry2<f64>)> {
+    let mut left = 0.0;
+    islands
+        .iter()
+        .map(|members| {
+            let turn = upright(outlines, poses, members);
+            let (low, high) = bounds(outlines, poses, members, &turn);
+            let motion = Isometry2::from_parts(Translation2::new(left - low.x, -low.y), turn);
+            left += high.x - low.x + outlines[members[0]].scale;
+            (members.clone(), motion)
+        })
+        .collect()
+}
+
+fn bounds(
+    outlines: &[&Outline],
+    poses: &[Isometry2<f64>],
+    members: &[usize],
+    turn: &UnitComplex<f64>,
+) -> (Vector2<f64>, Vector2<f64>) {
+    let mut low = Vector2::repeat(f64::INFINITY);
+    let mut high = Vector2::repeat(f64::NEG_INFINITY);
+    for &k in members {
+        for p in &outlines[k].points {
+            let p = turn * (poses[k] * p);
+            low = low.inf(&p.coords);
+            high = high.sup(&p.coords);
+        }
+    }
+    (low, high)
+}
+
+fn upright(outlines: &[&Outline], poses: &[Isometry2<f64>], members: &[usize]) -> UnitComplex<f64> {
+    let points: Vec<Point> =
+        members.iter().flat_map(|k| outlines[*k].points.iter().map(move |p| poses[*k] * p)).collect();
+    let hull = convex_hull(points);
+    let perimeter: f64 = (0..hull.len()).map(|i| (hull[(i + 1) % hull.len()] - hull[i]).norm()).sum();
+    let edges: Vec<Vector2<f64>> = members
+        .iter()
+        .flat_map(|k| outlines[*k].straights.iter().map(move |s| poses[*k] * s.to - poses[*k] * s.from))
+        .collect();
+    let angle = straight_direction(&edges, perimeter).unwrap_or_else(|| least_rectangle(&hull));
+    let mut turn = UnitComplex::new(-angle);
+    let (low, high) = bounds(outlines, poses, members, &turn);
+    let size = high - low;
+    let square = (size.x - size.y).abs() <= SQUARE * size.x.max(size.y);
+    if !square && size.y > size.x {
+        turn *= UnitComplex::new(FRAC_PI_2);
+    }
+    let quarter = if square { FRAC_PI_2 } else { PI };
+    let first = members.iter().min().copied().unwrap_or(0);
+    let now = (turn * poses[first].rotation).angle();
+    turn * UnitComplex::new(-(now / quarter).round() * quarter)
+}
+
+/// The direction, within a quarter turn, that straight edges agree on; `None` if there are too few.
+fn straight_direction(edges: &[Vector2<f64>], perimeter: f64) -> Option<f64> {
+    let mean = |near: Option<f64>| {
+        let (mut sum, mut length) = (Vector2::zeros(), 0.0);
+        for e in edges {
+            let a = e.y.atan2(e.x);
+            let off = |n: f64| ((a - n) / FRAC_PI_2 - ((a - n) / FRAC_PI_2).round()).abs() * FRAC_PI_2;
+            if near.is_none_or(|n| off(n) < STRAIGHT_SPREAD) {
+                sum += Vector2::new((4.0 * a).cos(), (4.0 * a).sin()) * e.norm();
+                length += e.norm();
+            }
+        }
+        (sum.y.atan2(sum.x) / 4.0, length)
+    };
+    let (rough, _) = mean(None);
+    let (angle, length) = mean(Some(rough));
+    (length > 0.0 && length >= STRAIGHT_SHARE * 0.5 * perimeter).then_some(angle)
+}
+
+/// Convex hull (Andrew 1979), running so that the turn is never negative.
+fn convex_hull(mut points: Vec<Point>) -> Vec<Point> {
+    points.sort_by(|p, q| p.x.total_cmp(&q.x).then(p.y.total_cmp(&q.y)));
+    let half = |points: &mut dyn Iterator<Item = Point>| {
+        let mut hull: Vec<Point> = Vec::new();
+        for p in points {
+            while hull.len() > 1 {
+                let (a, b) = (hull[hull.len() - 2], hull[hull.len() - 1]);
+                if (b - a).perp(&(p - a)) > 0.0 {
+                    break;
+                }
+                hull.pop();
+            }
+            hull.push(p);
+        }
+        hull.pop();
+        hull
+    };
+    let mut hull = half(&mut points.iter().copied());
+    hull.extend(half(&mut points.iter().rev().copied()));
+    hull
+}
+
+/// Direction of one side of the rectangle of least area about a convex polygon.
+fn least_rectangle(hull: &[Point]) -> f64 {
+    let mut best = (f64::INFINITY, 0.0);
+    for i in 0..hull.len() {
+        let d = hull[(i + 1) % hull.len()] - hull[i];
+        let Some(d) = d.try_normalize(f64::EPSILON) else { continue };
+        let across = Vector2::new(-d.y, d.x);
+        let (mut low, mut high) = (Vector2::repeat(f64::INFINITY), Vector2::repeat(f64::NEG_INFINITY));
+        for p in hull {
+            let v = Vector2::new(p.coords.dot(&d), p.coords.dot(&across));
+            low = low.inf(&v);
+            high = high.sup(&v);
+        }
+        let size = high - low;
+        if size.x * size.y < best.0 {
+            best = (size.x * size.y, d.y.atan2(d.x));
+        }
+    }
+    best.1
+}

@@ -1,0 +1,171 @@
+//! Shape index: the tabs whose isthmus distance function (IDF) is nearest to that of a mouth.
+//!
+//! A k-d tree over the leading cosine coefficients of the mean-removed IDF. The distance between two sets of
+//! coefficients never exceeds the root mean square difference of the whole functions, so the k nearest under the
+//! whole difference are exact. Neck width and path length are windows that each candidate must pass. Building is
+//! O(n log n), a query O(k log n) on the clustered shapes of tabs (measured growth: see the benches).
+
+use crate::outline::{KEYS, SHAPE_SAMPLES, Segment};
+
+/// Entries a leaf of the tree holds: below this a linear scan is faster than descending.
+const LEAF: usize = 16;
+
+/// One tab in the index.
+#[derive(Debug, Clone)]
+pub(crate) struct Entry<'a> {
+    /// Piece and position of the tab in the piece's list.
+    pub(crate) piece: u32,
+    pub(crate) tab: u32,
+    /// Rank of the piece by id, so that ties don't depend on the order of insertion.
+    pub(crate) rank: u32,
+    pub(crate) segment: &'a Segment,
+}
+
+/// Which differences of width and path length (mouth less neck), in pixels, a candidate may have.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(crate) struct Windows {
+    pub(crate) opening: (f64, f64),
+    pub(crate) path: (f64, f64),
+}
+
+/// The tree, implicit: entries ordered so that the median of each range splits it.
+pub(crate) struct Index<'a> {
+    entries: Vec<Entry<'a>>,
+    axes: Vec<u8>,
+}
+
+/// A tab found: distance, then piece and tab.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(crate) struct Hit {
+    pub(crate) distance: f32,
+    pub(crate) rank: u32,
+    pub(crate) piece: u32,
+    pub(crate) tab: u32,
+}
+
+impl Hit {
+    fn key(&self) -> (f32, u32, u32) {
+        (self.distance, self.rank, self.tab)
+    }
+
+    /// Order by distance, ties by id.
+    pub(crate) fn order(&self, other: &Self) -> std::cmp::Ordering {
+        let (a, b) = (self.key(), other.key());
+        a.0.total_cmp(&b.0).then(a.1.cmp(&b.1)).then(a.2.cmp(&b.2))
+    }
+}
+
+impl<'a> Index<'a> {
+    pub(crate) fn new(mut entries: Vec<Entry<'a>>) -> Self {
+        let mut axes = vec![0u8; entries.len()];
+        build(&mut entries, &mut axes);
+        Self { entries, axes }
+    }
+
+    /// The `k` nearest tabs of other pieces within the windows, nearest first.
+    pub(crate) fn nearest(&self, mouth: &Segment, piece: u32, windows: &Windows, k: usize) -> Vec<Hit> {
+        let mut query = Query { mouth, piece, windows, k, hits: Vec::with_capacity(k + 1) };
+        self.search(0, self.entries.len(), [0.0; KEYS], &mut query);
+        query.hits
+    }
+
+    fn search(&self, from: usize, to: usize, offsets: [f32; KEYS], query: &mut Query) {
+        if to - from <= LEAF {
+            for entry in &self.entries[from..to] {
+                query.offer(entry);
+            }
+            return;
+        }
+        let middle = (from + to) / 2;
+        let axis = self.axes[middle] as usize;
+        let difference = query.mouth.keys[axis] - self.entries[middle].segment.keys[axis];
+        let mut far = offsets;
+        far[axis] = difference.abs().max(far[axis]);
+        let bound: f32 = far.iter().map(|v| v * v).sum();
+        query.offer(&self.entries[middle]);
+        let (near, other) =
+            if difference < 0.0 { ((from, middle), (middle + 1, to)) } else { ((middle + 1, to), (from, middle)) };
+        self.search(near.0, near.1, offsets, query);
+        if bound.sqrt() <= query.limit() {
+            self.search(other.0, other.1, far, query);
+        }
+    }
+}
+
+fn build(entries: &mut [Entry], axes: &mut [u8]) {
+    if entries.len() <= LEAF {
+        return;
+    }
+    // The axis of the greatest spread halves the range best.
+    let mut spread = [0f32; KEYS];
+    for (axis, s) in spread.iter_mut().enumerate() {
+        let (mut low, mut high) = (f32::INFINITY, f32::NEG_INFINITY);
+        for e in entries.iter() {
+            low = low.min(e.segment.keys[axis]);
+            high = high.max(e.segment.keys[axis]);
+        }
+        *s = high - low;
+    }
+    let axis = (0..KEYS).max_by(|a, b| spread[*a].total_cmp(&spread[*b])).unwrap_or(0);
+    let middle = entries.len() / 2;
+    entries.select_nth_unstable_by(middle, |a, b| a.segment.keys[axis].total_cmp(&b.segment.keys[axis]));
+    axes[middle] = axis as u8;
+    let (left, right) = entries.split_at_mut(middle);
+    let (left_axes, right_axes) = axes.split_at_mut(middle);
+    build(left, left_axes);
+    build(&mut right[1..], &mut right_axes[1..]);
+}
+
+struct Query<'q> {
+    mouth: &'q Segment,
+    piece: u32,
+    windows: &'q Windows,
+    k: usize,
+    hits: Vec<Hit>,
+}
+
+impl Query<'_> {
+    fn limit(&self) -> f32 {
+        if self.hits.len() < self.k { f32::INFINITY } else { self.hits[self.k - 1].distance }
+    }
+
+    fn offer(&mut self, entry: &Entry) {
+        if entry.piece == self.piece {
+            return;
+        }
+        let opening = self.mouth.width - entry.segment.width;
+        let path = self.mouth.path - entry.segment.path;
+        let within = |v: f64, w: (f64, f64)| v >= w.0 && v <= w.1;
+        if !within(opening, self.windows.opening) || !within(path, self.windows.path) {
+            return;
+        }
+        let limit = self.limit();
+        if squares(&self.mouth.keys, &entry.segment.keys).sqrt() > limit {
+            return;
+        }
+        let distance = shape_distance(self.mouth, entry.segment);
+        let hit = Hit { distance, rank: entry.rank, piece: entry.piece, tab: entry.tab };
+        if distance > limit {
+            return;
+        }
+        let place = self.hits.partition_point(|h| h.order(&hit).is_lt());
+        self.hits.insert(place, hit);
+        self.hits.truncate(self.k);
+    }
+}
+
+fn squares<const N: usize>(a: &[f32; N], b: &[f32; N]) -> f32 {
+    a.iter().zip(b).map(|(x, y)| (x - y) * (x - y)).sum()
+}
+
+/// Root mean square difference of two mean-removed IDFs, in pixels.
+pub(crate) fn shape_distance(a: &Segment, b: &Segment) -> f32 {
+    let mut lanes = [0f32; 8];
+    for (x, y) in a.shape.chunks_exact(8).zip(b.shape.chunks_exact(8)) {
+        for k in 0..8 {
+            let d = x[k] - y[k];
+            lanes[k] += d * d;
+        }
+    }
+    (lanes.iter().sum::<f32>() / SHAPE_SAMPLES as f32).sqrt()
+}

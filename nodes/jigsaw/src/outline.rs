@@ -1,0 +1,535 @@
+//! A piece made ready for matching: normals, prepared match segments, a coarse distance raster, straight edges.
+//!
+//! Everything here depends on the one piece alone, so it is computed once, in parallel, when the piece is inserted.
+//! Coordinates are pixels of the piece's image (x right, y down) unless said otherwise.
+
+use crate::Piece;
+use isthmus::Point;
+use isthmus::isthmus::{Isthmus, Polarity};
+use nalgebra::{Isometry2, Matrix3, Matrix4, Vector2, Vector3, Vector4};
+
+/// Samples of an IDF in the shape index: enough for a tab (its finest feature is about a tenth of its path).
+pub(crate) const SHAPE_SAMPLES: usize = 64;
+/// Cosine coefficients of the IDF by which the index narrows the choice; the rest of the energy is small.
+pub(crate) const KEYS: usize = 8;
+/// How far a match segment is extended beyond its critical points at most, in piece scales (the shoulders up to the
+/// corners of a side one scale long with a tab of a third of it).
+const MAX_EXTENSION: f64 = 0.35;
+/// Cells of the raster along a piece scale: abutting borders then count for less than 0.1 % of overlap.
+const RASTER_CELLS: f64 = 24.0;
+/// Length of a straight run, in piece scales, from which on it is taken for a straight edge.
+const STRAIGHT_LENGTH: f64 = 0.4;
+/// How far the border may leave its chord in such a run, in piece scales.
+const STRAIGHT_TOLERANCE: f64 = 0.006;
+
+/// A point with its outward normal, relative to the isthmus point.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(crate) struct Node {
+    pub(crate) x: f32,
+    pub(crate) y: f32,
+    pub(crate) nx: f32,
+    pub(crate) ny: f32,
+}
+
+/// An isthmus made ready for matching.
+#[derive(Debug, Clone, PartialEq)]
+pub(crate) struct Segment {
+    /// Index of the isthmus in the piece's features.
+    pub(crate) isthmus: usize,
+    /// Isthmus point.
+    pub(crate) origin: Point,
+    /// Width and path length.
+    pub(crate) width: f64,
+    pub(crate) path: f64,
+    /// Arc of the first critical point.
+    pub(crate) arc: f64,
+    /// IDF samples, mean removed, in the order in which a tab runs (mouths reversed).
+    pub(crate) shape: [f32; SHAPE_SAMPLES],
+    /// Leading cosine coefficients of `shape`: a root mean square distance between keys never exceeds that of shapes.
+    pub(crate) keys: [f32; KEYS],
+    /// Border points of the extended segment in running order: every border point for a mouth, thinned for a tab.
+    pub(crate) run: Vec<Node>,
+    /// Border length between two nodes of `run`.
+    pub(crate) step: f64,
+    /// The nodes of `run` on the segment proper.
+    pub(crate) core: std::ops::Range<usize>,
+}
+
+/// A straight part of the border.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(crate) struct Straight {
+    pub(crate) from: Point,
+    pub(crate) to: Point,
+}
+
+/// Coarse signed distance to the border on a square raster, with the nearest border point.
+#[derive(Debug, Clone, PartialEq)]
+pub(crate) struct Raster {
+    pub(crate) origin: Point,
+    pub(crate) cell: f64,
+    pub(crate) columns: usize,
+    pub(crate) rows: usize,
+    /// Distance to the border, negative inside, at the cell centres.
+    pub(crate) distance: Vec<f32>,
+    /// Index of the nearest border point.
+    pub(crate) nearest: Vec<u32>,
+}
+
+/// A piece made ready.
+#[derive(Debug, Clone, PartialEq)]
+pub(crate) struct Outline {
+    pub(crate) points: Vec<Point>,
+    pub(crate) normals: Vec<Vector2<f32>>,
+    pub(crate) spacing: f64,
+    pub(crate) length: f64,
+    pub(crate) area: f64,
+    /// Square root of the area: the unit of all relative tolerances.
+    pub(crate) scale: f64,
+    pub(crate) centroid: Point,
+    /// Greatest distance of a border point from the centroid.
+    pub(crate) radius: f64,
+    pub(crate) noise: f64,
+    pub(crate) tabs: Vec<Segment>,
+    pub(crate) mouths: Vec<Segment>,
+    pub(crate) straights: Vec<Straight>,
+    pub(crate) raster: Raster,
+}
+
+impl Outline {
+    pub(crate) fn new(piece: &Piece) -> Self {
+        let border = &piece.features.border;
+        let points = border.points.clone();
+        let n = points.len();
+        let spacing = border.spacing.max(f64::EPSILON);
+        let mut twice_area = 0.0;
+        let mut moment = Vector2::zeros();
+        let origin = points[0];
+        for i in 0..n {
+            let (a, b) = (points[i] - origin, points[(i + 1) % n] - origin);
+            let cross = a.x * b.y - a.y * b.x;
+            twice_area += cross;
+            moment += (a + b) * cross;
+        }
+        let area = (0.5 * twice_area).abs().max(f64::EPSILON);
+        let centroid = if twice_area.abs() > f64::EPSILON { origin + moment / (3.0 * twice_area) } else { origin };
+        let normals: Vec<Vector2<f32>> = (0..n)
+            .map(|i| {
+                let d = points[(i + 1) % n] - points[(i + n - 1) % n];
+                let length = d.norm().max(f64::EPSILON);
+                Vector2::new((d.y / length) as f32, (-d.x / length) as f32)
+            })
+            .collect();
+        let radius = points.iter().map(|p| (p - centroid).norm()).fold(0.0, f64::max);
+        let mut outline = Self {
+            raster: Raster::new(&points, &normals, area.sqrt() / RASTER_CELLS),
+            points,
+            normals,
+            spacing,
+            length: n as f64 * spacing,
+            area,
+            scale: area.sqrt(),
+            centroid,
+            radius,
+            noise: piece.features.noise.max(0.0),
+            tabs: Vec::new(),
+            mouths: Vec::new(),
+            straights: Vec::new(),
+        };
+        outline.straights = outline.find_straights();
+        for (index, isthmus) in piece.features.isthmuses.iter().enumerate() {
+            if !usable(isthmus) {
+                continue;
+            }
+            let segment = outline.prepare(index, isthmus);
+            match isthmus.polarity {
+                Polarity::Positive => outline.tabs.push(segment),
+                Polarity::Negative => outline.mouths.push(segment),
+            }
+        }
+        outline
+    }
+
+    /// Border point at an index that may lie outside `0..n`.
+    fn at(&self, index: i64) -> Point {
+        self.points[index.rem_euclid(self.points.len() as i64) as usize]
+    }
+
+    /// Point at an arc length from the first border point.
+    pub(crate) fn at_arc(&self, arc: f64) -> Point {
+        let s = arc / self.spacing;
+        let i = s.floor();
+        let (a, b) = (self.at(i as i64), self.at(i as i64 + 1));
+        a + (b - a) * (s - i)
+    }
+
+    fn prepare(&self, index: usize, isthmus: &Isthmus) -> Segment {
+        let tab = isthmus.polarity == Polarity::Positive;
+        let mut shape = [0f32; SHAPE_SAMPLES];
+        for (k, sample) in shape.iter_mut().enumerate() {
+            let part = k as f64 / (SHAPE_SAMPLES - 1) as f64;
+            let part = if tab { part } else { 1.0 - part };
+            *sample = (self.at_arc(isthmus.arc[0] + part * isthmus.path_length) - isthmus.point).norm() as f32;
+        }
+        let mean = shape.iter().sum::<f32>() / SHAPE_SAMPLES as f32;
+        shape.iter_mut().for_each(|v| *v -= mean);
+        let first = (isthmus.arc[0] / self.spacing).ceil() as i64;
+        let last = ((isthmus.arc[0] + isthmus.path_length) / self.spacing).floor() as i64;
+        let (before, after) = (self.extension(isthmus, first, -1), self.extension(isthmus, last, 1));
+        // A tab is sampled as densely as its IDF; a mouth keeps every point, for its feet are looked for on it.
+        let thin = if tab { ((last - first) as usize / SHAPE_SAMPLES).max(1) as i64 } else { 1 };
+        let n = self.points.len() as i64;
+        let begin = first - before / thin * thin;
+        let run: Vec<Node> = (0..)
+            .map(|k| begin + k * thin)
+            .take_while(|i| *i <= last + after && *i < begin + n)
+            .map(|i| {
+                let p = self.at(i) - isthmus.point;
+                let normal = self.normals[i.rem_euclid(n) as usize];
+                Node { x: p.x as f32, y: p.y as f32, nx: normal.x, ny: normal.y }
+            })
+            .collect();
+        let core_from = ((first - begin) / thin) as usize;
+        let core_to = (((last - begin) / thin) as usize + 1).min(run.len());
+        Segment {
+            isthmus: index,
+            origin: isthmus.point,
+            width: isthmus.width,
+            path: isthmus.path_length,
+            arc: isthmus.arc[0],
+            keys: keys(&shape),
+            shape,
+            run,
+            step: thin as f64 * self.spacing,
+            core: core_from.min(core_to)..core_to,
+        }
+    }
+
+    /// How many border points beyond a critical point still belong to the side: up to the corner, where the border,
+    /// having run along the chord, turns into the body (or up into the next tab).
+    fn extension(&self, isthmus: &Isthmus, from: i64, direction: i64) -> i64 {
+        const ALONG: f64 = 0.77; // cos 40°: has come round to the direction of the chord
+        const DOWN: f64 = 0.77; // sin 50°: turned towards the body, a corner
+        const UP: f64 = 0.87; // sin 60°: turned away from the body, another tab
+        let critical = isthmus.critical_points[usize::from(direction > 0)];
+        let Some(outward) = (critical - isthmus.point).try_normalize(f64::EPSILON) else { return 0 };
+        let middle = self.at_arc(isthmus.arc[0] + 0.5 * isthmus.path_length) - isthmus.point;
+        let mut body = Vector2::new(-outward.y, outward.x);
+        let into_segment = body.dot(&middle) > 0.0;
+        if into_segment == (isthmus.polarity == Polarity::Positive) {
+            body = -body;
+        }
+        let most = ((MAX_EXTENSION * self.scale / self.spacing) as i64)
+            .min((self.points.len() as i64 - (isthmus.path_length / self.spacing) as i64) / 2 - 1)
+            .max(0);
+        let window = ((0.02 * self.scale / self.spacing) as i64).max(2);
+        let mut along = false;
+        for k in 0..most {
+            let i = from + direction * k;
+            let d = self.at(i + direction * window) - self.at(i - direction * window);
+            let d = d / d.norm().max(f64::EPSILON);
+            if along {
+                let down = d.dot(&body);
+                if !(-UP..=DOWN).contains(&down) {
+                    return (k - window).max(0);
+                }
+            } else {
+                along = d.dot(&outward) > ALONG;
+            }
+        }
+        most
+    }
+
+    fn find_straights(&self) -> Vec<Straight> {
+        let n = self.points.len() as i64;
+        let window = (STRAIGHT_LENGTH * self.scale / self.spacing) as i64;
+        let stride = (window / 20).max(1);
+        let tolerance = STRAIGHT_TOLERANCE * self.scale + 3.0 * self.noise;
+        if window < 4 || window >= n {
+            return Vec::new();
+        }
+        let is_straight = |from: i64, to: i64| {
+            let (a, b) = (self.at(from), self.at(to));
+            let Some(d) = (b - a).try_normalize(f64::EPSILON) else { return false };
+            (from..=to).step_by(stride as usize).all(|i| {
+                let p = self.at(i) - a;
+                (p.x * d.y - p.y * d.x).abs() <= tolerance
+            })
+        };
+        let mut found: Vec<(i64, i64)> = Vec::new();
+        let mut i = 0;
+        while i < n {
+            if is_straight(i, i + window) {
+                let mut to = i + window;
+                while to < i + n && is_straight(i, to + stride) {
+                    to += stride;
+                }
+                found.push((i, to));
+                i = to;
+            } else {
+                i += stride;
+            }
+        }
+        // The walk began somewhere: a run across the start was seen in two parts.
+        if found.len() > 1 {
+            let (first, last) = (found[0], found[found.len() - 1]);
+            if last.1 + stride >= n + first.0 && is_straight(last.0, first.1 + n) {
+                found[0] = (last.0, first.1 + n);
+                found.pop();
+            }
+        }
+        found.into_iter().map(|(a, b)| Straight { from: self.at(a), to: self.at(b) }).collect()
+    }
+}
+
+/// Whether the figures of an isthmus can be worked with (messages may carry anything).
+fn usable(isthmus: &Isthmus) -> bool {
+    let numbers = [isthmus.width, isthmus.path_length, isthmus.arc[0], isthmus.point.x, isthmus.point.y];
+    numbers.iter().all(|v| v.is_finite()) && isthmus.width > 0.0 && isthmus.path_length > isthmus.width
+}
+
+/// Leading coefficients of the orthonormal cosine transform, scaled to root mean square.
+fn keys(shape: &[f32; SHAPE_SAMPLES]) -> [f32; KEYS] {
+    let n = SHAPE_SAMPLES as f32;
+    std::array::from_fn(|k| {
+        let w = std::f32::consts::PI * (k + 1) as f32 / n;
+        let sum: f32 = shape.iter().enumerate().map(|(i, v)| v * (w * (i as f32 + 0.5)).cos()).sum();
+        sum * (2.0f32).sqrt() / n
+    })
+}
+
+impl Raster {
+    /// Two sweeps of nearest-point propagation (Danielsson), exact enough at this coarseness.
+    fn new(points: &[Point], normals: &[Vector2<f32>], cell: f64) -> Self {
+        let cell = cell.max(1e-6);
+        let (mut low, mut high) = (points[0], points[0]);
+        for p in points {
+            low = Point::new(low.x.min(p.x), low.y.min(p.y));
+            high = Point::new(high.x.max(p.x), high.y.max(p.y));
+        }
+        const MARGIN: f64 = 2.0; // cells: a neighbour's border in contact still finds its foot
+        // A degenerate outline (all in a line) would have a vanishing cell.
+        let cell = cell.max((high - low).norm() / 512.0);
+        let origin = Point::new(low.x - MARGIN * cell, low.y - MARGIN * cell);
+        let columns = ((high.x - low.x) / cell + 2.0 * MARGIN) as usize + 1;
+        let rows = ((high.y - low.y) / cell + 2.0 * MARGIN) as usize + 1;
+        let centre =
+            |c: usize, r: usize| Point::new(origin.x + (c as f64 + 0.5) * cell, origin.y + (r as f64 + 0.5) * cell);
+        let mut nearest = vec![u32::MAX; columns * rows];
+        let mut square = vec![f64::INFINITY; columns * rows];
+        for (i, p) in points.iter().enumerate() {
+            let (c, r) = (((p.x - origin.x) / cell) as usize, ((p.y - origin.y) / cell) as usize);
+            let k = r.min(rows - 1) * columns + c.min(columns - 1);
+            let d = (centre(c, r) - p).norm_squared();
+            if d < square[k] {
+                (square[k], nearest[k]) = (d, i as u32);
+            }
+        }
+        let mut relax = |c: usize, r: usize, dc: i64, dr: i64| {
+            let (oc, or) = (c as i64 + dc, r as i64 + dr);
+            if oc < 0 || or < 0 || oc >= columns as i64 || or >= rows as i64 {
+                return;
+            }
+            let other = nearest[or as usize * columns + oc as usize];
+            if other == u32::MAX {
+                return;
+            }
+            let d = (centre(c, r) - points[other as usize]).norm_squared();
+            let k = r * columns + c;
+            if d < square[k] {
+                (square[k], nearest[k]) = (d, other);
+            }
+        };
+        for _ in 0..2 {
+            for r in 0..rows {
+                for c in 0..columns {
+                    for (dc, dr) in [(-1, 0), (0, -1), (-1, -1), (1, -1)] {
+                        relax(c, r, dc, dr);
+                    }
+                }
+                for c in (0..columns).rev() {
+                    relax(c, r, 1, 0);
+                }
+            }
+            for r in (0..rows).rev() {
+                for c in (0..columns).rev() {
+                    for (dc, dr) in [(1, 0), (0, 1), (1, 1), (-1, 1)] {
+                        relax(c, r, dc, dr);
+                    }
+                }
+                for c in 0..columns {
+                    relax(c, r, -1, 0);
+                }
+            }
+        }
+        let mut distance = vec![0f32; columns * rows];
+        for r in 0..rows {
+            for c in 0..columns {
+                let k = r * columns + c;
+                let i = nearest[k] as usize;
+                let d = centre(c, r) - points[i];
+                let side = d.x * f64::from(normals[i].x) + d.y * f64::from(normals[i].y);
+                distance[k] = d.norm().copysign(side) as f32;
+            }
+        }
+        Self { origin, cell, columns, rows, distance, nearest }
+    }
+
+    /// Cell that holds a point.
+    pub(crate) fn cell_of(&self, p: Point) -> Option<usize> {
+        let c = (p.x - self.origin.x) / self.cell;
+        let r = (p.y - self.origin.y) / self.cell;
+        (c >= 0.0 && r >= 0.0 && c < self.columns as f64 && r < self.rows as f64)
+            .then(|| r as usize * self.columns + c as usize)
+    }
+}
+
+/// Points of the thinned border along a piece scale, for overlap checks.
+const SPARSE_STEP: f64 = 16.0;
+
+/// How deep and over what length the border of `a` runs inside `b`: the sum of depth times length, in square pixels.
+/// For a shallow overlap this is its area.
+fn intrusion(a: &Outline, b: &Outline, b_from_a: &Isometry2<f64>) -> f64 {
+    let stride = ((a.scale / SPARSE_STEP / a.spacing) as usize).max(1);
+    let reach = b.radius * b.radius;
+    let mut sum = 0.0;
+    for p in a.points.iter().step_by(stride) {
+        let p = b_from_a * p;
+        if (p - b.centroid).norm_squared() > reach {
+            continue;
+        }
+        let Some(k) = b.raster.cell_of(p) else { continue };
+        if f64::from(b.raster.distance[k]) > b.raster.cell {
+            continue;
+        }
+        let i = b.raster.nearest[k] as usize;
+        let d = p - b.points[i];
+        let depth = -(d.x * f64::from(b.normals[i].x) + d.y * f64::from(b.normals[i].y));
+        if depth > 0.0 {
+            sum += depth.min(-f64::from(b.raster.distance[k]) + b.raster.cell);
+        }
+    }
+    sum * stride as f64 * a.spacing
+}
+
+/// Area in which two pieces overlap, in square pixels: exact for shallow overlaps, large for deep ones.
+pub(crate) fn overlap_area(a: &Outline, b: &Outline, b_from_a: &Isometry2<f64>) -> f64 {
+    let centre = b_from_a * a.centroid;
+    if (centre - b.centroid).norm() > a.radius + b.radius {
+        return 0.0;
+    }
+    intrusion(a, b, b_from_a).max(intrusion(b, a, &b_from_a.inverse()))
+}
+
+/// What two outlines in a given pose say about each other.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(crate) struct Contact {
+    /// Length of border in contact, in pixels.
+    pub(crate) length: f64,
+    /// Mean |distance - clearance| over it, in pixels.
+    pub(crate) residual: f64,
+    /// Median distance, positive for a gap.
+    pub(crate) clearance: f64,
+    /// Middle of the contact, in `b`'s image.
+    pub(crate) centre: Point,
+    /// Normal matrix and right side over the motion (x, y, turn) of `a` at `centre`, in `b`'s image, clearance
+    /// eliminated.
+    pub(crate) hessian: Matrix3<f64>,
+    pub(crate) gradient: Vector3<f64>,
+}
+
+/// Prior of a joint's clearance: mean and standard deviation, and the deviation of a border point, in pixels.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(crate) struct ClearancePrior {
+    pub(crate) mean: f64,
+    pub(crate) deviation: f64,
+    pub(crate) noise: f64,
+}
+
+/// Follows the border of `a` along that of `b`, within `band` pixels of it, every `stride`-th point.
+pub(crate) fn contact(
+    a: &Outline,
+    b: &Outline,
+    b_from_a: &Isometry2<f64>,
+    band: f64,
+    stride: usize,
+    prior: &ClearancePrior,
+) -> Option<Contact> {
+    /// Normals of borders in contact are opposite to within 45°.
+    const OPPOSED: f32 = -0.7;
+    let n = b.points.len();
+    let reach = (b.radius + band).powi(2);
+    let rotation = b_from_a.rotation;
+    let mut rows: Vec<(f64, Vector2<f64>, Point)> = Vec::new();
+    for (k, p) in a.points.iter().enumerate().step_by(stride) {
+        let p = b_from_a * p;
+        if (p - b.centroid).norm_squared() > reach {
+            continue;
+        }
+        let Some(cell) = b.raster.cell_of(p) else { continue };
+        if f64::from(b.raster.distance[cell]).abs() > band + b.raster.cell {
+            continue;
+        }
+        let mut i = b.raster.nearest[cell] as usize;
+        let mut best = (p - b.points[i]).norm_squared();
+        loop {
+            let (next, previous) = ((i + 1) % n, (i + n - 1) % n);
+            let (dn, dp) = ((p - b.points[next]).norm_squared(), (p - b.points[previous]).norm_squared());
+            if dn < best && dn <= dp {
+                (best, i) = (dn, next);
+            } else if dp < best {
+                (best, i) = (dp, previous);
+            } else {
+                break;
+            }
+        }
+        let q = b.points[i];
+        let along = (b.points[(i + 1) % n] - q).dot(&(p - q));
+        let other = if along >= 0.0 { (i + 1) % n } else { (i + n - 1) % n };
+        let edge = b.points[other] - q;
+        let part = ((p - q).dot(&edge) / edge.norm_squared().max(f64::EPSILON)).clamp(0.0, 1.0);
+        let normal = b.normals[i] * (1.0 - part as f32) + b.normals[other] * part as f32;
+        let mine = rotation * Vector2::new(f64::from(a.normals[k].x), f64::from(a.normals[k].y));
+        if normal.x * mine.x as f32 + normal.y * mine.y as f32 > OPPOSED {
+            continue;
+        }
+        let normal = Vector2::new(f64::from(normal.x), f64::from(normal.y)).normalize();
+        let distance = (p - (q + edge * part)).dot(&normal);
+        if distance.abs() <= band {
+            rows.push((distance, normal, p));
+        }
+    }
+    if rows.len() < 4 {
+        return None;
+    }
+    let mut distances: Vec<f64> = rows.iter().map(|r| r.0).collect();
+    let middle = distances.len() / 2;
+    let clearance = *distances.select_nth_unstable_by(middle, f64::total_cmp).1;
+    let mut off: Vec<f64> = rows.iter().map(|r| (r.0 - clearance).abs()).collect();
+    let spread = *off.select_nth_unstable_by(middle, f64::total_cmp).1;
+    let width = (3.0 * spread).max(1e-3);
+    let centre = Point::from(rows.iter().fold(Vector2::zeros(), |s, r| s + r.2.coords) / rows.len() as f64);
+    let mut h = Matrix4::zeros();
+    let mut g = Vector4::zeros();
+    for (distance, normal, p) in &rows {
+        let r = distance - clearance;
+        let w = 1.0 / (1.0 + (r / width).powi(2)).powi(2);
+        let p = p - centre;
+        let j = Vector4::new(normal.x, normal.y, p.x * normal.y - p.y * normal.x, -1.0);
+        h += j * j.transpose() * w;
+        g += j * (w * r);
+    }
+    let pull = (prior.noise.max(spread) / prior.deviation.max(1e-3)).powi(2);
+    h[(3, 3)] += pull;
+    g[3] += pull * (clearance - prior.mean);
+    let column: Vector3<f64> = h.fixed_view::<3, 1>(0, 3).into_owned();
+    let hessian = h.fixed_view::<3, 3>(0, 0).into_owned() - column * column.transpose() / h[(3, 3)];
+    let gradient = g.fixed_rows::<3>(0).into_owned() - column * (g[3] / h[(3, 3)]);
+    Some(Contact {
+        length: rows.len() as f64 * stride as f64 * a.spacing,
+        residual: rows.iter().map(|r| (r.0 - clearance).abs()).sum::<f64>() / rows.len() as f64,
+        clearance,
+        centre,
+        hessian,
+        gradient,
+    })
+}
