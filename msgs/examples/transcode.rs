@@ -1,8 +1,8 @@
 //! Decodes messages that another implementation encoded, and encodes them again, so that the two can be compared.
 //!
 //! Each line of standard input is `full_type_name hex_of_cdr`, without the four-byte CDR header. The answer is a line of JSON:
-//! `{"type", "hash", "definition", "consumed", "message", "cdr"}`, or `{"type", "error"}`. Without input, `--types` prints the
-//! names of all types.
+//! `{"type", "hash", "definition", "consumed", "message", "cdr"}`, or `{"type", "error"}`. A type name alone stands for the
+//! type's default. `--types` prints the names of all types instead.
 
 use std::io::{self, BufRead, Write};
 
@@ -10,17 +10,19 @@ use byteorder::LittleEndian;
 use jigsaw_msgs::{MESSAGE_TYPES, Message, Visitor, visit};
 use serde_json::{Value, json};
 
-/// Decodes the bytes as some type, and encodes the result.
+/// Decodes the bytes as some type, or takes its default, and encodes the result.
 struct Transcode {
-    cdr: Vec<u8>,
+    cdr: Option<Vec<u8>>,
 }
 
 impl Visitor for Transcode {
     type Output = Result<Value, String>;
 
     fn visit<M: Message>(self) -> Self::Output {
-        let (message, consumed): (M, usize) =
-            cdr_encoding::from_bytes::<M, LittleEndian>(&self.cdr).map_err(|error| error.to_string())?;
+        let (message, consumed) = match self.cdr {
+            None => (M::default(), 0),
+            Some(cdr) => cdr_encoding::from_bytes::<M, LittleEndian>(&cdr).map_err(|error| error.to_string())?,
+        };
         let cdr = cdr_encoding::to_vec::<M, LittleEndian>(&message).map_err(|error| error.to_string())?;
         let message = serde_json::to_value(&message).map_err(|error| error.to_string())?;
         let hex: String = cdr.iter().map(|byte| format!("{byte:02x}")).collect();
@@ -42,9 +44,12 @@ fn from_hex(text: &str) -> Result<Vec<u8>, String> {
 }
 
 fn answer(line: &str) -> Value {
-    let (name, hex) = line.split_once(' ').unwrap_or((line, ""));
-    let done = from_hex(hex)
-        .and_then(|cdr| visit(name, Transcode { cdr }).unwrap_or_else(|| Err("the type is not known".to_owned())));
+    let (name, cdr) = match line.split_once(' ') {
+        Some((name, hex)) => (name, from_hex(hex).map(Some)),
+        None => (line, Ok(None)),
+    };
+    let done =
+        cdr.and_then(|cdr| visit(name, Transcode { cdr }).unwrap_or_else(|| Err("the type is not known".to_owned())));
     let mut answer = done.unwrap_or_else(|error| json!({"error": error}));
     answer["type"] = name.into();
     answer

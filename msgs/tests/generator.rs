@@ -85,13 +85,37 @@ fn constants_defaults_and_arrays_become_rust() {
     }
 }
 
-/// The default of a type as JSON: an object whose keys stand in the order of the fields.
-struct DefaultAsJson;
+/// The fields of a type in their order, with their default values.
+struct DefaultFields;
 
-impl Visitor for DefaultAsJson {
-    type Output = Json;
-    fn visit<M: Message>(self) -> Json {
-        serde_json::to_value(M::default()).unwrap()
+impl Visitor for DefaultFields {
+    type Output = Vec<(String, Json)>;
+    fn visit<M: Message>(self) -> Self::Output {
+        let json = serde_json::to_string(&M::default()).unwrap();
+        serde_json::from_str::<InOrder>(&json).unwrap().0
+    }
+}
+
+/// A JSON object whose order is kept.
+struct InOrder(Vec<(String, Json)>);
+
+impl<'de> serde::Deserialize<'de> for InOrder {
+    fn deserialize<D: serde::Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
+        struct Entries;
+        impl<'de> serde::de::Visitor<'de> for Entries {
+            type Value = InOrder;
+            fn expecting(&self, formatter: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+                formatter.write_str("an object")
+            }
+            fn visit_map<A: serde::de::MapAccess<'de>>(self, mut map: A) -> Result<InOrder, A::Error> {
+                let mut entries = Vec::new();
+                while let Some(entry) = map.next_entry()? {
+                    entries.push(entry);
+                }
+                Ok(InOrder(entries))
+            }
+        }
+        deserializer.deserialize_map(Entries)
     }
 }
 
@@ -141,16 +165,14 @@ fn rust_types_and_definition_files_say_the_same() {
         };
         for (section, fields) in names.iter().zip(sections) {
             let type_name = format!("{full_name}{section}");
-            let json = visit(&type_name, DefaultAsJson).unwrap_or_else(|| panic!("no Rust type for {type_name}"));
-            let json = json.as_object().unwrap();
-            let rust_fields: Vec<&String> = json.keys().collect();
+            let rust = visit(&type_name, DefaultFields).unwrap_or_else(|| panic!("no Rust type for {type_name}"));
+            let rust_fields: Vec<&String> = rust.iter().map(|(name, _)| name).collect();
             if fields.is_empty() {
                 assert_eq!(rust_fields, ["structure_needs_at_least_one_member"], "{type_name}");
             } else {
                 assert_eq!(rust_fields, fields.iter().map(|(_, name)| name).collect::<Vec<_>>(), "{type_name}");
             }
-            for (ty, name) in fields {
-                let value = &json[&name];
+            for ((ty, name), (_, value)) in fields.iter().zip(&rust) {
                 let fits = match ty.as_str() {
                     list if list.ends_with(']') => value.is_array(),
                     "bool" => value.is_boolean(),
@@ -178,7 +200,7 @@ fn types_are_found_by_name() {
         assert_eq!(MessageType::find_dds(known.dds_name), Some(known));
     }
     assert_eq!(MessageType::find("std_msgs/msg/Nonsense"), None);
-    assert!(visit("std_msgs/msg/Nonsense", DefaultAsJson).is_none());
+    assert!(visit("std_msgs/msg/Nonsense", DefaultFields).is_none());
 }
 
 #[test]

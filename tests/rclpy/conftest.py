@@ -1,0 +1,257 @@
+"""What the tests share: the real binaries as processes, rclpy nodes that are spun until something happens, and puzzles with
+truth.
+
+Nothing here sleeps: a test waits for an event, and a time limit turns a missing event into a failure.
+"""
+
+import json
+import os
+import random
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+
+HERE = Path(__file__).parent
+ROOT = HERE.parent.parent
+
+# Read by the middleware when a participant is made, so before anything imports rclpy.
+os.environ["FASTDDS_DEFAULT_PROFILES_FILE"] = str(HERE / "fastdds_loopback.xml")
+os.environ["FASTRTPS_DEFAULT_PROFILES_FILE"] = str(HERE / "fastdds_loopback.xml")
+os.environ["AMENT_PREFIX_PATH"] = sys.prefix
+os.environ["RMW_IMPLEMENTATION"] = "rmw_fastrtps_cpp"
+os.environ.pop("ROS_LOCALHOST_ONLY", None)
+
+import pytest  # noqa: E402
+import rclpy  # noqa: E402
+from rclpy.executors import SingleThreadedExecutor  # noqa: E402
+from rclpy.qos import QoSDurabilityPolicy, QoSProfile, QoSReliabilityPolicy  # noqa: E402
+
+EVENT_TIMEOUT = 30.0  # seconds until an awaited event counts as missing; on an idle machine all come within 2
+EXIT_TIMEOUT = 10.0  # seconds that a process may take to end after SIGTERM
+
+LATCHED = QoSProfile(
+    depth=1, reliability=QoSReliabilityPolicy.RELIABLE, durability=QoSDurabilityPolicy.TRANSIENT_LOCAL
+)
+BEST_EFFORT = QoSProfile(depth=10, reliability=QoSReliabilityPolicy.BEST_EFFORT)
+
+# RTPS: the discovery port of the first participant of a domain, and what lies between those of two domains.
+FIRST_PORT, PORTS_PER_DOMAIN = 7410, 250
+LAST_DOMAIN = 99  # above about 100 the ports reach into those that Linux gives out
+
+
+
+@pytest.fixture(scope="session")
+def binaries():
+    """The folder of the binaries, built if need be."""
+    if given := os.environ.get("JIGSAW_BIN_DIR"):
+        return Path(given)
+    command = ["cargo", "build", "--quiet", "--workspace", "--bins", "--examples", "--message-format=json"]
+    built = subprocess.run(command, cwd=ROOT, stdout=subprocess.PIPE, check=True, text=True)
+    artifacts = (json.loads(line) for line in built.stdout.splitlines() if line.startswith("{"))
+    executables = [Path(a["executable"]) for a in artifacts if a.get("executable")]
+    return next(path.parent for path in executables if path.parent.name != "examples")
+
+
+@pytest.fixture(scope="session")
+def transcode(binaries):
+    """The Rust side of the message types; see test_messages.py."""
+
+    class Transcode:
+        command = str(binaries / "examples" / "transcode")
+
+        def __init__(self):
+            self.process = subprocess.Popen(
+                [self.command], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, bufsize=1
+            )
+
+        def types(self):
+            return subprocess.run([self.command, "--types"], capture_output=True, text=True, check=True).stdout.split()
+
+        def ask(self, full_name, data=None):
+            """Decodes the bytes; without any, tells of the type's default."""
+            line = full_name if data is None else f"{full_name} {bytes(data).hex()}"
+            self.process.stdin.write(line + "\n")
+            return json.loads(self.process.stdout.readline())
+
+    transcode = Transcode()
+    yield transcode
+    transcode.process.stdin.close()
+    assert transcode.process.wait(EXIT_TIMEOUT) == 0
+
+
+@pytest.fixture
+def domain():
+    """A DDS domain that nobody uses, so that tests neither hear each other nor anything else on this machine."""
+    first = 1 + random.SystemRandom().randrange(LAST_DOMAIN)
+    for candidate in [1 + (first + k) % LAST_DOMAIN for k in range(LAST_DOMAIN)]:
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+            try:
+                probe.bind(("0.0.0.0", FIRST_PORT + PORTS_PER_DOMAIN * candidate))
+            except OSError:
+                continue
+            return candidate
+    pytest.fail("every DDS domain is in use")
+
+
+@dataclass
+class Process:
+    """One of the binaries, running."""
+
+    name: str
+    child: subprocess.Popen
+    log: Path
+
+    def text(self):
+        return self.log.read_text(errors="replace")
+
+    def stop(self):
+        """Ends it as an operator would; gives its exit code."""
+        if self.child.poll() is None:
+            self.child.send_signal(signal.SIGTERM)
+        try:
+            return self.child.wait(EXIT_TIMEOUT)
+        except subprocess.TimeoutExpired:
+            self.child.kill()
+            self.child.wait()
+            pytest.fail(f"{self.name} did not end within {EXIT_TIMEOUT} s of SIGTERM\n{self.text()}")
+
+    def wait(self, timeout=EVENT_TIMEOUT):
+        """Waits for it to end by itself; gives its exit code."""
+        return self.child.wait(timeout)
+
+
+@dataclass
+class Launcher:
+    """Starts binaries in one domain, and ends them with the test."""
+
+    binaries: Path
+    domain: int
+    folder: Path
+    processes: list = field(default_factory=list)
+
+    def start(self, name, *arguments):
+        log = self.folder / f"{len(self.processes)}_{name}.log"
+        environment = os.environ | {"ROS_DOMAIN_ID": str(self.domain), "ROS_LOCALHOST_ONLY": "1"}
+        with log.open("wb") as out:
+            child = subprocess.Popen(
+                [self.binaries / name, *map(str, arguments)],
+                env=environment,
+                stdin=subprocess.DEVNULL,
+                stdout=out,
+                stderr=subprocess.STDOUT,
+            )
+        process = Process(name, child, log)
+        self.processes.append(process)
+        return process
+
+    def run(self, name, *arguments, timeout=60):
+        """Runs a binary to its end; gives its exit code and what it printed."""
+        process = self.start(name, *arguments)
+        self.processes.remove(process)
+        return process.wait(timeout), process.text()
+
+    def cell(self, *ros_arguments):
+        """The three nodes, a process each."""
+        arguments = ["--ros-args", *ros_arguments] if ros_arguments else []
+        return [self.start(name, *arguments) for name in ("capture_node", "feature_node", "solver_node")]
+
+    def stop_all(self):
+        codes = {process.name: process.stop() for process in self.processes}
+        return codes
+
+
+@pytest.fixture
+def launcher(binaries, domain, tmp_path, request):
+    launcher = Launcher(binaries, domain, tmp_path)
+    yield launcher
+    codes = launcher.stop_all()
+    for process in launcher.processes:  # shown by pytest where the test failed
+        print(f"--- {process.name} ---\n{process.text()}")
+    assert not any(codes.values()), f"a node did not end cleanly: {codes}"
+
+
+class Harness:
+    """A rclpy context in the test's domain, with nodes that are spun together."""
+
+    def __init__(self, domain):
+        self.context = rclpy.Context()
+        rclpy.init(context=self.context, domain_id=domain)
+        self.executor = SingleThreadedExecutor(context=self.context)
+        self.nodes = []
+
+    def node(self, name, **options):
+        node = rclpy.create_node(name, context=self.context, **options)
+        self.nodes.append(node)
+        self.executor.add_node(node)
+        return node
+
+    def until(self, condition, what, timeout=EVENT_TIMEOUT):
+        """Spins until the condition gives something true, and gives that back."""
+        deadline = time.monotonic() + timeout
+        while not (result := condition()):
+            if time.monotonic() > deadline:
+                pytest.fail(f"after {timeout} s still no {what}")
+            self.executor.spin_once(timeout_sec=0.05)
+        return result
+
+    def call(self, client, request, timeout=EVENT_TIMEOUT):
+        """Calls a service and gives its answer."""
+        self.until(client.service_is_ready, f"service {client.srv_name}", timeout)
+        future = client.call_async(request)
+        self.until(future.done, f"answer of {client.srv_name}", timeout)
+        return future.result()
+
+    def latest(self, node, message_type, topic, qos=LATCHED):
+        """Subscribes; the returned list always holds what came."""
+        received = []
+        node.create_subscription(message_type, topic, received.append, qos)
+        return received
+
+    def close(self):
+        self.executor.shutdown()
+        for node in self.nodes:
+            node.destroy_node()
+        rclpy.shutdown(context=self.context)
+
+
+@pytest.fixture
+def ros(domain):
+    harness = Harness(domain)
+    yield harness
+    harness.close()
+
+
+@dataclass
+class Puzzle:
+    """A generated puzzle: a folder of frames with one piece each, and what is true of it."""
+
+    folder: Path
+    truth: dict
+
+    @property
+    def frames(self):
+        return [self.folder / piece["source"] for piece in self.truth["pieces"]]
+
+
+@pytest.fixture(scope="session")
+def generate(binaries, tmp_path_factory):
+    """Generates puzzles by the command line, each once a session."""
+    made = {}
+
+    def generate(rows, columns, seed, *options):
+        key = (rows, columns, seed, *options)
+        if key not in made:
+            folder = tmp_path_factory.mktemp("puzzle") / "frames"
+            command = [binaries / "jigsaw", "generate", "--rows", rows, "--cols", columns, "--seed", seed]
+            subprocess.run([*map(str, [*command, *options]), "--out", str(folder)], check=True, capture_output=True)
+            made[key] = Puzzle(folder, json.loads((folder / "truth.json").read_text()))
+        return made[key]
+
+    yield generate
+    for puzzle in made.values():
+        shutil.rmtree(puzzle.folder)
