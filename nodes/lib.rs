@@ -3,3 +3,5 @@
 //! ```text
 //! image ── capture ── pieces/image ── feature ── pieces/features ── solver ── assembly, /tf_static
 //! ```
+
+pub mod bag;

@@ -1,0 +1,307 @@
+//! sqlite3 storage: reading schema versions 1 to 4, writing version 4.
+
+use std::collections::HashMap;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+
+use rusqlite::{Connection, OpenFlags, OptionalExtension, params};
+
+use super::read::{FileContents, MAX_RECORD_BYTES, MessageIter, Selection};
+use super::write::StorageWriter;
+use super::{BagError, BagWarning, RawMessage, Topic, TopicCount, qos};
+
+/// The first bytes of every sqlite3 database.
+pub(super) const MAGIC: &[u8] = b"SQLite format 3\0";
+
+/// Keys of messages fetched ahead; their contents are fetched one by one, so that memory does not depend on their size.
+const PAGE_ROWS: i64 = 4096;
+
+/// Tables of schema version 4, as `rosbag2_storage_sqlite3` lays them out.
+const SCHEMA: &str = "
+    CREATE TABLE schema(schema_version INTEGER PRIMARY KEY, ros_distro TEXT NOT NULL);
+    CREATE TABLE metadata(id INTEGER PRIMARY KEY, metadata_version INTEGER NOT NULL, metadata TEXT NOT NULL);
+    CREATE TABLE topics(id INTEGER PRIMARY KEY, name TEXT NOT NULL, type TEXT NOT NULL,
+        serialization_format TEXT NOT NULL, offered_qos_profiles TEXT NOT NULL, type_description_hash TEXT NOT NULL);
+    CREATE TABLE message_definitions(id INTEGER PRIMARY KEY, topic_type TEXT NOT NULL, encoding TEXT NOT NULL,
+        encoded_message_definition TEXT NOT NULL, type_description_hash TEXT NOT NULL);
+    CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id INTEGER NOT NULL, timestamp INTEGER NOT NULL,
+        data BLOB NOT NULL);
+    CREATE INDEX timestamp_idx ON messages (timestamp ASC);
+    INSERT INTO schema(schema_version, ros_distro) VALUES (4, '');
+";
+
+fn damaged(path: &Path, error: &rusqlite::Error) -> BagError {
+    BagError::Damaged { path: path.to_owned(), reason: error.to_string() }
+}
+
+/// A database that was looked through.
+pub(super) struct SqliteFile {
+    path: PathBuf,
+    topics: HashMap<i64, Arc<Topic>>,
+}
+
+fn connect(path: &Path) -> Result<Connection, BagError> {
+    let flags = OpenFlags::SQLITE_OPEN_READ_ONLY | OpenFlags::SQLITE_OPEN_NO_MUTEX;
+    let connection = Connection::open_with_flags(path, flags).map_err(|e| damaged(path, &e))?;
+    // A damaged page may claim anything; a message longer than this is refused by the library itself.
+    let limit = i32::try_from(MAX_RECORD_BYTES).unwrap_or(i32::MAX);
+    connection.set_limit(rusqlite::limits::Limit::SQLITE_LIMIT_LENGTH, limit).map_err(|e| damaged(path, &e))?;
+    Ok(connection)
+}
+
+impl SqliteFile {
+    /// Reads topics and counts.
+    pub(super) fn open(path: &Path) -> Result<(Self, FileContents), BagError> {
+        let connection = connect(path)?;
+        let fail = |e: rusqlite::Error| damaged(path, &e);
+        let topics = read_topics(&connection).map_err(fail)?;
+        let mut warning = None;
+        let counts = read_counts(&connection).unwrap_or_else(|e| {
+            warning = Some(e.to_string());
+            Vec::new()
+        });
+        let by_id: HashMap<i64, Arc<Topic>> = topics.iter().cloned().collect();
+        let total: u64 = counts.iter().map(|c| c.messages).sum();
+        let span_ns = counts.iter().map(|c| c.first_ns).min().zip(counts.iter().map(|c| c.last_ns).max());
+        let contents = FileContents {
+            topics: topics
+                .into_iter()
+                .map(|(id, topic)| TopicCount {
+                    topic,
+                    messages: counts.iter().find(|c| c.topic_id == id).map_or(0, |c| c.messages),
+                })
+                .collect(),
+            span_ns,
+            warning: warning.map(|reason| BagWarning::Incomplete { path: path.to_owned(), reason, messages: total }),
+        };
+        Ok((Self { path: path.to_owned(), topics: by_id }, contents))
+    }
+
+    /// The messages of the selection, ordered by time.
+    pub(super) fn messages(&self, selection: &Selection) -> Result<MessageIter, BagError> {
+        let topics = self.topics.iter().filter(|(_, t)| selection.has_topic(&t.name));
+        Ok(Box::new(Rows {
+            path: self.path.clone(),
+            connection: connect(&self.path)?,
+            topics: topics.map(|(id, t)| (*id, t.clone())).collect(),
+            after: None,
+            from_ns: selection.from_ns,
+            page: Vec::new().into_iter(),
+            ended: false,
+        }))
+    }
+}
+
+struct CountRow {
+    topic_id: i64,
+    messages: u64,
+    first_ns: i64,
+    last_ns: i64,
+}
+
+fn has_column(connection: &Connection, table: &str, column: &str) -> rusqlite::Result<bool> {
+    connection
+        .query_row("SELECT 1 FROM pragma_table_info(?1) WHERE name = ?2", params![table, column], |_| Ok(()))
+        .optional()
+        .map(|found| found.is_some())
+}
+
+fn read_topics(connection: &Connection) -> rusqlite::Result<Vec<(i64, Arc<Topic>)>> {
+    // Columns came with the schema versions; asking for them is simpler and more tolerant than the version number.
+    let column = |table: &str, name: &str, otherwise: &str| -> rusqlite::Result<String> {
+        Ok(if has_column(connection, table, name)? { name.to_owned() } else { otherwise.to_owned() })
+    };
+    let sql = format!(
+        "SELECT id, name, type, serialization_format, {}, {} FROM topics ORDER BY id",
+        column("topics", "offered_qos_profiles", "''")?,
+        column("topics", "type_description_hash", "''")?,
+    );
+    let mut definitions: HashMap<String, String> = HashMap::new();
+    if has_column(connection, "message_definitions", "encoded_message_definition")? {
+        let mut statement = connection.prepare(
+            "SELECT topic_type, encoded_message_definition FROM message_definitions WHERE encoding = 'ros2msg'",
+        )?;
+        let rows = statement.query_map([], |row| Ok((row.get(0)?, row.get(1)?)))?;
+        for row in rows {
+            let (type_name, definition) = row?;
+            definitions.insert(type_name, definition);
+        }
+    }
+    let mut statement = connection.prepare(&sql)?;
+    let rows = statement.query_map([], |row| {
+        let type_name: String = row.get(2)?;
+        let topic = Topic {
+            name: row.get(1)?,
+            definition: definitions.get(&type_name).cloned().unwrap_or_default(),
+            type_name,
+            serialization: row.get(3)?,
+            offered_qos: qos::parse_profiles(&row.get::<_, String>(4)?),
+            type_hash: row.get(5)?,
+        };
+        Ok((row.get(0)?, Arc::new(topic)))
+    })?;
+    rows.collect()
+}
+
+fn read_counts(connection: &Connection) -> rusqlite::Result<Vec<CountRow>> {
+    let mut statement = connection
+        .prepare("SELECT topic_id, COUNT(*), MIN(timestamp), MAX(timestamp) FROM messages GROUP BY topic_id")?;
+    let rows = statement.query_map([], |row| {
+        Ok(CountRow {
+            topic_id: row.get(0)?,
+            messages: u64::try_from(row.get::<_, i64>(1)?).unwrap_or(0),
+            first_ns: row.get(2)?,
+            last_ns: row.get(3)?,
+        })
+    })?;
+    rows.collect()
+}
+
+/// Where a message lies: the page holds only these.
+#[derive(Clone, Copy)]
+struct Key {
+    time_ns: i64,
+    id: i64,
+    topic_id: i64,
+}
+
+struct Rows {
+    path: PathBuf,
+    connection: Connection,
+    topics: HashMap<i64, Arc<Topic>>,
+    after: Option<Key>,
+    from_ns: i64,
+    page: std::vec::IntoIter<Key>,
+    ended: bool,
+}
+
+impl Rows {
+    fn next_page(&self) -> rusqlite::Result<Vec<Key>> {
+        let (time, id) = self.after.map_or((self.from_ns, i64::MIN), |key| (key.time_ns, key.id));
+        let mut statement = self.connection.prepare_cached(
+            "SELECT timestamp, id, topic_id FROM messages WHERE timestamp >= ?1 AND (timestamp > ?1 OR id > ?2) \
+             ORDER BY timestamp, id LIMIT ?3",
+        )?;
+        let rows = statement.query_map(params![time, id, PAGE_ROWS], |row| {
+            Ok(Key { time_ns: row.get(0)?, id: row.get(1)?, topic_id: row.get(2)? })
+        })?;
+        rows.collect()
+    }
+
+    fn data(&self, id: i64) -> rusqlite::Result<Vec<u8>> {
+        let mut statement = self.connection.prepare_cached("SELECT data FROM messages WHERE id = ?1")?;
+        statement.query_row([id], |row| row.get(0))
+    }
+
+    fn step(&mut self) -> Option<rusqlite::Result<RawMessage>> {
+        loop {
+            let Some(key) = self.page.next() else {
+                match self.next_page() {
+                    Err(e) => return Some(Err(e)),
+                    Ok(page) if page.is_empty() => return None,
+                    Ok(page) => {
+                        self.after = page.last().copied();
+                        self.page = page.into_iter();
+                        continue;
+                    }
+                }
+            };
+            let Some(topic) = self.topics.get(&key.topic_id) else { continue };
+            return Some(self.data(key.id).map(|cdr| RawMessage {
+                topic: topic.clone(),
+                log_time_ns: key.time_ns,
+                publish_time_ns: key.time_ns,
+                cdr,
+            }));
+        }
+    }
+}
+
+impl Iterator for Rows {
+    type Item = Result<RawMessage, BagError>;
+
+    fn next(&mut self) -> Option<Self::Item> {
+        if self.ended {
+            return None;
+        }
+        let item = self.step().map(|result| result.map_err(|e| damaged(&self.path, &e)));
+        self.ended = !matches!(item, Some(Ok(_)));
+        item
+    }
+}
+
+/// Writes an sqlite3 bag file. What is flushed survives when the process is killed.
+pub(super) struct SqliteWriter {
+    path: PathBuf,
+    connection: Connection,
+    topics: u16,
+}
+
+impl SqliteWriter {
+    pub(super) fn create(path: &Path) -> Result<Self, BagError> {
+        // Claims the name, so that nobody else's file is appended to.
+        std::fs::File::create_new(path).map_err(|source| BagError::Io { path: path.to_owned(), source })?;
+        let create = || -> rusqlite::Result<Connection> {
+            let connection = Connection::open(path)?;
+            connection.execute_batch(SCHEMA)?;
+            connection.execute_batch("BEGIN")?;
+            Ok(connection)
+        };
+        let connection = create().map_err(|e| write_error(path, &e))?;
+        Ok(Self { path: path.to_owned(), connection, topics: 0 })
+    }
+}
+
+fn write_error(path: &Path, error: &rusqlite::Error) -> BagError {
+    BagError::Write { path: path.to_owned(), reason: error.to_string() }
+}
+
+impl StorageWriter for SqliteWriter {
+    fn add_topic(&mut self, topic: &Topic) -> Result<u16, BagError> {
+        let full = || BagError::Write { path: self.path.clone(), reason: "more than 65535 topics".to_owned() };
+        let id = self.topics.checked_add(1).ok_or_else(full)?;
+        let insert = || -> rusqlite::Result<()> {
+            self.connection.execute(
+                "INSERT INTO topics VALUES(?1, ?2, ?3, ?4, ?5, ?6)",
+                params![
+                    id,
+                    topic.name,
+                    topic.type_name,
+                    topic.serialization,
+                    qos::profiles_to_yaml(&topic.offered_qos),
+                    topic.type_hash
+                ],
+            )?;
+            self.connection.execute(
+                "INSERT INTO message_definitions \
+                 (topic_type, encoding, encoded_message_definition, type_description_hash) \
+                 SELECT ?1, 'ros2msg', ?2, ?3 \
+                 WHERE NOT EXISTS (SELECT 1 FROM message_definitions WHERE topic_type = ?1)",
+                params![topic.type_name, topic.definition, topic.type_hash],
+            )?;
+            Ok(())
+        };
+        insert().map_err(|e| write_error(&self.path, &e))?;
+        self.topics = id;
+        Ok(id)
+    }
+
+    fn write(&mut self, id: u16, log_time_ns: i64, _publish_time_ns: i64, cdr: &[u8]) -> Result<(), BagError> {
+        self.connection
+            .prepare_cached("INSERT INTO messages (topic_id, timestamp, data) VALUES(?1, ?2, ?3)")
+            .and_then(|mut statement| statement.execute(params![id, log_time_ns, cdr]))
+            .map(|_| ())
+            .map_err(|e| write_error(&self.path, &e))
+    }
+
+    fn flush(&mut self) -> Result<(), BagError> {
+        self.connection.execute_batch("COMMIT; BEGIN").map_err(|e| write_error(&self.path, &e))
+    }
+
+    fn finish(&mut self, metadata_yaml: &str) -> Result<(), BagError> {
+        self.connection
+            .execute("INSERT INTO metadata(metadata_version, metadata) VALUES(9, ?1)", [metadata_yaml])
+            .and_then(|_| self.connection.execute_batch("COMMIT"))
+            .map_err(|e| write_error(&self.path, &e))
+    }
+}
