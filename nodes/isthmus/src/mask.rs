@@ -1,4 +1,42 @@
 //! Segmentation of a frame into shapes.
+//!
+//! # Method
+//! 1. *Ground*: the frame is averaged over small blocks; the class of blocks (N. Otsu, 1979) that prevails along the rim is
+//!    ground, and a quadratic surface through it follows uneven light. Shapes may be darker, brighter or of another colour. Where
+//!    the rim does not tell (a tight crop round a shape), both classes are tried, and the one that gives
+//!    whole shapes is right.
+//! 2. *Blocks that stand out* from the ground by more than its scatter are joined to connected components. The threshold is
+//!    near the ground, so that dark print on dark ground still belongs to its shape.
+//! 3. *Pixels*: about each component the frame is cut out, in a form in which half-way between two fixed levels is half-way
+//!    between the shape's own level near the border and the ground's: as it is, where both are uniform, else
+//!    divided by the local contrast. Pixels beyond half-way are joined to components once more: neighbours whose shadows
+//!    or glow met come apart.
+//! 4. *Rejection*, each with its [`Reason`]: cut by the frame's edge, too small beside the others, thread-like (hairs,
+//!    scanner edges), faint (glare), two shapes that touch.
+//!
+//! # Cost
+//! Linear in the number of pixels; memory linear as well, since thread-like components are never cut out.
+//!
+//! # Failure
+//! [`MaskError`] for a frame that is inconsistent. A frame without shapes gives an empty list.
+//!
+//! ```
+//! use isthmus::mask::{Frame, segment};
+//! let mut pixels = vec![200u8; 64 * 64];
+//! for y in 20..44 {
+//!     pixels[y * 64 + 16..y * 64 + 48].fill(30);
+//! }
+//! let segmentation = segment(&Frame::grey(64, 64, &pixels)?, &Default::default());
+//! let [cutout] = &segmentation.cutouts[..] else { panic!("one shape") };
+//! assert_eq!((cutout.aoi.x, cutout.aoi.y, cutout.aoi.width, cutout.aoi.height), (16, 20, 32, 24));
+//! # Ok::<(), isthmus::mask::MaskError>(())
+//! ```
+
+mod ground;
+mod runs;
+
+use ground::{Blocks, Ground, median, quantile};
+use runs::{Component, Components};
 
 /// A rectangle of whole pixels of the source frame.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -28,4 +66,707 @@ pub struct Cutout {
     pub ground_level: f32,
     /// Standard deviation of the grey levels.
     pub noise_level: f32,
+}
+
+/// How the pixels of a frame are stored.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum PixelFormat {
+    /// One byte a pixel.
+    Grey,
+    /// Three bytes a pixel; their order does not matter here.
+    Rgb,
+}
+
+/// A picture in memory, rows from top to bottom.
+#[derive(Debug, Clone, Copy)]
+pub struct Frame<'a> {
+    format: PixelFormat,
+    width: usize,
+    height: usize,
+    stride: usize,
+    pixels: &'a [u8],
+}
+
+/// Why a frame cannot be read.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[non_exhaustive]
+pub enum MaskError {
+    /// No pixels, or too many to address.
+    #[error("frame of {width} x {height} pixels: both must be from 1 to {MAX_SIDE}")]
+    Size {
+        /// Columns.
+        width: u32,
+        /// Rows.
+        height: u32,
+    },
+    /// The distance between rows is less than a row.
+    #[error("stride of {stride} bytes is less than the {row} bytes of a row")]
+    Stride {
+        /// Bytes from one row to the next.
+        stride: usize,
+        /// Bytes of a row.
+        row: usize,
+    },
+    /// Bytes are missing.
+    #[error("frame holds {bytes} bytes: its size and stride need {needed}")]
+    Bytes {
+        /// Bytes there are.
+        bytes: usize,
+        /// Bytes needed.
+        needed: usize,
+    },
+}
+
+/// Largest side of a frame in pixels: coordinates are 32-bit, and 2^17 is beyond any camera or scanner.
+pub const MAX_SIDE: u32 = 1 << 17;
+
+impl<'a> Frame<'a> {
+    /// A frame whose rows are `stride` bytes apart (the last one may be shorter).
+    ///
+    /// # Errors
+    /// [`MaskError`] where size, stride and number of bytes do not fit each other.
+    pub fn new(
+        format: PixelFormat,
+        width: u32,
+        height: u32,
+        stride: usize,
+        pixels: &'a [u8],
+    ) -> Result<Self, MaskError> {
+        if !(1..=MAX_SIDE).contains(&width) || !(1..=MAX_SIDE).contains(&height) {
+            return Err(MaskError::Size { width, height });
+        }
+        let row = width as usize * format.channels();
+        if stride < row {
+            return Err(MaskError::Stride { stride, row });
+        }
+        let needed = stride.saturating_mul(height as usize - 1).saturating_add(row);
+        if pixels.len() < needed {
+            return Err(MaskError::Bytes { bytes: pixels.len(), needed });
+        }
+        Ok(Self { format, width: width as usize, height: height as usize, stride, pixels })
+    }
+
+    /// A grey frame without gaps between rows.
+    ///
+    /// # Errors
+    /// [`MaskError`] where size and number of bytes do not fit each other.
+    pub fn grey(width: u32, height: u32, pixels: &'a [u8]) -> Result<Self, MaskError> {
+        Self::new(PixelFormat::Grey, width, height, width as usize, pixels)
+    }
+
+    /// A colour frame without gaps between rows.
+    ///
+    /// # Errors
+    /// [`MaskError`] where size and number of bytes do not fit each other.
+    pub fn rgb(width: u32, height: u32, pixels: &'a [u8]) -> Result<Self, MaskError> {
+        Self::new(PixelFormat::Rgb, width, height, 3 * width as usize, pixels)
+    }
+
+    fn row(&self, y: usize) -> &'a [u8] {
+        &self.pixels[y * self.stride..][..self.width * self.format.channels()]
+    }
+}
+
+/// What a shape must be like to be accepted.
+#[derive(Debug, Clone, PartialEq)]
+#[non_exhaustive]
+pub struct Parameters {
+    /// Least area in pixels. Default 256: the smallest real pieces with a measurable outline (16 px across).
+    pub min_area: usize,
+    /// Least area as a part of the frame's typical shape (the one that half of all shape area is in shapes at least as
+    /// large as). Default 0.2: pieces of one puzzle differ by less; printed labels and crumbs are smaller.
+    pub min_relative_area: f64,
+    /// Least contrast as a part of the frame's typical shape. Default 0.2: glare and shadows have less.
+    pub min_relative_contrast: f64,
+    /// Least part of its bounding box that a shape fills. Default 0.08: hairs and scanner edges fill less.
+    pub min_fill: f64,
+}
+
+impl Default for Parameters {
+    fn default() -> Self {
+        Self { min_area: 256, min_relative_area: 0.2, min_relative_contrast: 0.2, min_fill: 0.08 }
+    }
+}
+
+/// Why something that differs from the ground is not taken for a shape.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+#[non_exhaustive]
+pub enum Reason {
+    /// The frame's edge cuts it.
+    CutByFrame,
+    /// It is too small, by itself or beside the other shapes.
+    Small,
+    /// It is a thread: a hair, the edge of the scanner's glass.
+    Thread,
+    /// It differs far less from the ground than the other shapes: glare, a shadow.
+    Faint,
+    /// Two shapes touch.
+    Touching,
+}
+
+/// Something that differs from the ground and is not taken for a shape.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Rejected {
+    /// Its bounding box.
+    pub aoi: Aoi,
+    /// Its area in pixels.
+    pub area: usize,
+    /// Why.
+    pub reason: Reason,
+}
+
+/// What a frame shows.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub struct Segmentation {
+    /// The shapes, in reading order of the top left corners of their bounding boxes.
+    pub cutouts: Vec<Cutout>,
+    /// What was left out, specks of less than [`MIN_REPORTED_AREA`] pixels aside, in the same order.
+    pub rejected: Vec<Rejected>,
+}
+
+/// Specks smaller than this, in pixels, are not reported: noise and dust make any number of them.
+pub const MIN_REPORTED_AREA: usize = 64;
+
+/// Pixels of ground round a shape in its cutout: room for the blur that the contour may need.
+const MARGIN: usize = 8;
+/// Levels of shape and ground in a cutout that had to be divided by the local contrast: the room above and below keeps
+/// noise from being clipped.
+const DIVIDED_LEVELS: [f32; 2] = [200.0, 50.0];
+/// Most spread of the shape's level (between its quartiles), as a part of the contrast, at which the pixels are cut out as
+/// they are: the contour half-way moves by a twentieth of the edge's blur at most.
+const UNIFORM: f32 = 0.12;
+/// A shape alone in the frame may touch the edges if it spans this part of the frame in both directions: then the frame
+/// was cropped to the shape.
+const TIGHT_SPAN: f64 = 0.9;
+/// ... and if it covers at most this part of the frame's rim.
+const TIGHT_CONTACT: f64 = 0.6;
+/// ... and has this part of all the area that stands out.
+const TIGHT_SHARE: f64 = 0.9;
+/// How many blocks beyond the inner blocks of a shape its levels matter: the border runs through the first or second.
+const BORDER_BLOCKS: usize = 4;
+/// Most differences of neighbouring pixels looked at to measure the noise: beyond, the figure gets no better.
+const NOISE_SAMPLES: usize = 20_000;
+
+/// Finds the shapes of a frame.
+#[must_use]
+pub fn segment(frame: &Frame<'_>, parameters: &Parameters) -> Segmentation {
+    Segmenter::default().segment(frame, parameters)
+}
+
+/// Finds shapes, keeping its buffers from one frame to the next.
+#[derive(Debug, Clone, Default)]
+pub struct Segmenter {
+    blocks: Blocks,
+    coarse: Components,
+    fine: Components,
+    /// For each block the coarse component that owns it, or [`NOBODY`]: its blocks and those next to them.
+    owner: Vec<u32>,
+    crop: Crop,
+}
+
+const NOBODY: u32 = u32::MAX;
+
+/// The surroundings of a coarse component.
+#[derive(Debug, Clone, Default)]
+struct Crop {
+    x: i32,
+    y: i32,
+    width: usize,
+    height: usize,
+    pixels: Vec<u8>,
+    shape_level: f32,
+    ground_level: f32,
+    noise_level: f32,
+    /// Contrast in the grey levels of the frame.
+    contrast: f32,
+}
+
+impl Segmenter {
+    /// Finds the shapes of a frame.
+    #[must_use]
+    pub fn segment(&mut self, frame: &Frame<'_>, parameters: &Parameters) -> Segmentation {
+        self.blocks.fill(frame);
+        let mut best: Option<(usize, Segmentation)> = None;
+        for candidate in ground::candidates(&self.blocks) {
+            let ground = ground::fit(&self.blocks, candidate);
+            let segmentation = self.shapes(frame, &ground, parameters);
+            let area = segmentation.cutouts.iter().map(|c| c.aoi.width as usize * c.aoi.height as usize).sum();
+            if best.as_ref().is_none_or(|(most, _)| area > *most) {
+                best = Some((area, segmentation));
+            }
+        }
+        best.map(|(_, segmentation)| segmentation).unwrap_or_default()
+    }
+
+    /// Finds the shapes that stand out from a ground.
+    fn shapes(&mut self, frame: &Frame<'_>, ground: &Ground, parameters: &Parameters) -> Segmentation {
+        let columns = self.blocks.columns;
+        self.coarse.clear();
+        for (row, residual) in ground.residual.chunks_exact(columns).enumerate() {
+            self.coarse.begin_row(row);
+            self.coarse.add_row(0, residual, |r| r > ground.threshold);
+        }
+        self.coarse.close();
+        self.claim_blocks();
+
+        let mut found: Vec<Found> = Vec::new();
+        let mut rejected = Vec::new();
+        let block = self.blocks.size;
+        for k in 0..self.coarse.list.len() {
+            let c = self.coarse.list[k];
+            let area = c.area * block * block;
+            let aoi = Aoi {
+                x: (c.left * block) as i32,
+                y: (c.top * block) as i32,
+                width: ((c.right - c.left) * block).min(frame.width - c.left * block) as u32,
+                height: ((c.bottom - c.top) * block).min(frame.height - c.top * block) as u32,
+            };
+            let box_area = aoi.width as usize * aoi.height as usize;
+            let thread = (area as f64) < parameters.min_fill * box_area as f64;
+            if area < parameters.min_area || thread {
+                if area >= MIN_REPORTED_AREA {
+                    rejected.push(Rejected { aoi, area, reason: if thread { Reason::Thread } else { Reason::Small } });
+                }
+                continue;
+            }
+            self.cut_out(frame, ground, k);
+            self.label_pixels();
+            self.collect(frame, parameters, &mut found, &mut rejected);
+        }
+        sift(frame, parameters, found, rejected)
+    }
+
+    /// Makes every coarse component own its blocks and the free ones next to them.
+    fn claim_blocks(&mut self) {
+        let (columns, rows) = (self.blocks.columns, self.blocks.rows);
+        self.owner.clear();
+        self.owner.resize(columns * rows, NOBODY);
+        for run in &self.coarse.runs {
+            let label = run.label as u32;
+            self.owner[run.row * columns + run.start..run.row * columns + run.end].fill(label);
+        }
+        for run in &self.coarse.runs {
+            let label = run.label as u32;
+            for row in run.row.saturating_sub(1)..rows.min(run.row + 2) {
+                for column in run.start.saturating_sub(1)..columns.min(run.end + 1) {
+                    let owner = &mut self.owner[row * columns + column];
+                    if *owner == NOBODY {
+                        *owner = label;
+                    }
+                }
+            }
+        }
+    }
+
+    /// Cuts a coarse component's surroundings out of the frame into `self.crop`.
+    fn cut_out(&mut self, frame: &Frame<'_>, ground: &Ground, k: usize) {
+        let c = self.coarse.list[k];
+        let (block, columns) = (self.blocks.size, self.blocks.columns);
+        let levels = self.levels(ground, k);
+        let crop = &mut self.crop;
+        let margin = MARGIN + block;
+        let rows = RowSource { frame, ground, block };
+        (crop.x, crop.y) = ((c.left * block) as i32 - margin as i32, (c.top * block) as i32 - margin as i32);
+        crop.width = (c.right - c.left) * block + 2 * margin;
+        crop.height = (c.bottom - c.top) * block + 2 * margin;
+        crop.contrast = levels.contrast;
+        let plain = levels.uniform && frame.format == PixelFormat::Grey;
+        if plain {
+            crop.ground_level = levels.ground;
+            crop.shape_level = levels.ground + levels.sense * levels.contrast;
+        } else if levels.uniform {
+            (crop.shape_level, crop.ground_level) = (levels.contrast, 0.0);
+        } else {
+            [crop.shape_level, crop.ground_level] = DIVIDED_LEVELS;
+        }
+        let ground_pixel = crop.ground_level.round().clamp(0.0, 255.0) as u8;
+        crop.pixels.clear();
+        crop.pixels.resize(crop.width * crop.height, ground_pixel);
+        let label = k as u32;
+        for (row, out) in crop.pixels.chunks_exact_mut(crop.width).enumerate() {
+            let y = crop.y + row as i32;
+            if y < 0 || y >= frame.height as i32 {
+                continue;
+            }
+            let y = y as usize;
+            let from = crop.x.max(0) as usize;
+            let to = frame.width.min((crop.x + crop.width as i32) as usize);
+            let out = &mut out[(from as i32 - crop.x) as usize..][..to - from];
+            let source = frame.row(y);
+            let owners = &self.owner[y / block * columns..][..columns];
+            if plain {
+                out.copy_from_slice(&source[from..to]);
+            } else {
+                levels.fill_row(&rows, (y, from), out, [crop.shape_level, crop.ground_level]);
+            }
+            // What belongs to other components is made ground.
+            let within = from / block..to.div_ceil(block);
+            for (column, owner) in within.clone().zip(&owners[within]) {
+                if *owner != label && *owner != NOBODY {
+                    let (start, end) = ((column * block).max(from), ((column + 1) * block).min(to));
+                    out[start - from..end - from].fill(ground_pixel);
+                }
+            }
+        }
+        self.crop.noise_level = self.noise(ground, k);
+    }
+
+    /// Levels of a coarse component and of the ground round it.
+    fn levels(&self, ground: &Ground, k: usize) -> Levels {
+        let c = self.coarse.list[k];
+        let columns = self.blocks.columns;
+        let inside = |column: usize, row: usize| -> bool {
+            // A block all of whose neighbours belong to the component, those beyond the frame included.
+            (row.saturating_sub(1)..self.blocks.rows.min(row + 2)).all(|r| {
+                (column.saturating_sub(1)..columns.min(column + 2)).all(|c| {
+                    self.owner[r * columns + c] == k as u32 && ground.residual[r * columns + c] > ground.threshold
+                })
+            })
+        };
+        let (width, height) = (c.right - c.left, c.bottom - c.top);
+        let mut contrast = vec![0.0f32; width * height];
+        let mut list = Vec::new();
+        let mut signed = Vec::new();
+        for row in c.top..c.bottom {
+            for column in c.left..c.right {
+                let block = row * columns + column;
+                if self.owner[block] == k as u32 && inside(column, row) {
+                    contrast[(row - c.top) * width + column - c.left] = ground.residual[block];
+                    list.push(ground.residual[block]);
+                    if let ([plane], [surface]) = (&self.blocks.planes[..], &ground.surfaces[..]) {
+                        signed.push(plane[block] - surface.at(column as f64, row as f64));
+                    }
+                }
+            }
+        }
+        if list.is_empty() {
+            // Thinner than three blocks: the strongest blocks are the best there is.
+            for row in c.top..c.bottom {
+                for column in c.left..c.right {
+                    let block = row * columns + column;
+                    if self.owner[block] == k as u32 {
+                        list.push(ground.residual[block]);
+                        if let ([plane], [surface]) = (&self.blocks.planes[..], &ground.surfaces[..]) {
+                            signed.push(plane[block] - surface.at(column as f64, row as f64));
+                        }
+                    }
+                }
+            }
+            let top = quantile(&mut list, 0.9);
+            list = vec![top];
+            contrast.fill(top);
+        }
+        let middle = quantile(&mut list, 0.5);
+        let spread = quantile(&mut list, 0.75) - quantile(&mut list, 0.25);
+        let mixed = signed.iter().filter(|s| **s > 0.0).count();
+        let sense = if 2 * mixed >= signed.len() { 1.0 } else { -1.0 };
+        // A twentieth of the blocks may be specks or print.
+        let one_sided = !signed.is_empty() && mixed.min(signed.len() - mixed) * 20 <= signed.len();
+        let corner =
+            |column: usize, row: usize| ground.surfaces.first().map_or(0.0, |s| s.at(column as f64, row as f64));
+        let corners = [
+            corner(c.left, c.top),
+            corner(c.right, c.top),
+            corner(c.left, c.bottom),
+            corner(c.right, c.bottom),
+            corner((c.left + c.right) / 2, (c.top + c.bottom) / 2),
+        ];
+        let (low, high) = corners.iter().fold((f32::MAX, f32::MIN), |(l, h), v| (l.min(*v), h.max(*v)));
+        let grey = self.blocks.planes.len() == 1;
+        let uniform = spread <= UNIFORM * middle && high - low <= UNIFORM * middle && (one_sided || !grey);
+        let ground_level = corners.iter().sum::<f32>() / corners.len() as f32;
+        let mut levels = Levels {
+            left: c.left,
+            top: c.top,
+            width,
+            height,
+            contrast: middle,
+            map: contrast,
+            uniform,
+            sense,
+            one_sided,
+            ground: ground_level,
+        };
+        if !uniform {
+            levels.spread_out(2.0 * ground.threshold);
+        }
+        levels
+    }
+
+    /// Standard deviation of the grey levels of `self.crop`, from differences of neighbouring pixels, in shape and ground; the larger.
+    fn noise(&self, ground: &Ground, k: usize) -> f32 {
+        /// Lower quartile and median of the absolute difference of two normal numbers, in standard deviations.
+        const QUARTILE: f32 = 0.450_6;
+        const MEDIAN: f32 = 0.953_9;
+        let crop = &self.crop;
+        let (block, columns) = (self.blocks.size, self.blocks.columns);
+        let (mut shape, mut clear) = (Vec::new(), Vec::new());
+        let step = (crop.width * crop.height / NOISE_SAMPLES).max(1);
+        for at in (0..crop.pixels.len() - 1).step_by(step) {
+            let (x, y) = (crop.x + (at % crop.width) as i32, crop.y + (at / crop.width) as i32);
+            let (column, row) = (x.max(0) as usize / block, y.max(0) as usize / block);
+            if x < 0 || y < 0 || column >= columns || row >= self.blocks.rows || (at + 1) % crop.width == 0 {
+                continue;
+            }
+            let here = row * columns + column;
+            let (before, after) = (column.saturating_sub(1), (column + 1).min(columns - 1));
+            let neighbours = [row * columns + before, row * columns + after, row.saturating_sub(1) * columns + column];
+            let stands_out = |b: &usize| ground.residual[*b] > ground.threshold;
+            let difference = f32::from(crop.pixels[at].abs_diff(crop.pixels[at + 1]));
+            if stands_out(&here) && self.owner[here] == k as u32 && neighbours.iter().all(stands_out) {
+                shape.push(difference);
+            } else if self.owner[here] == NOBODY {
+                clear.push(difference);
+            }
+        }
+        // Print and texture are not noise: half of a shape is free of them.
+        (quantile(&mut shape, 0.25) / QUARTILE).max(median(clear) / MEDIAN)
+    }
+
+    /// Connects the pixels of `self.crop` that are beyond half-way from ground to shape.
+    fn label_pixels(&mut self) {
+        let crop = &self.crop;
+        let level = (crop.shape_level + crop.ground_level) / 2.0;
+        self.fine.clear();
+        for (y, row) in crop.pixels.chunks_exact(crop.width).enumerate() {
+            self.fine.begin_row(y);
+            if crop.shape_level > crop.ground_level {
+                let least = level.floor() as u8;
+                self.fine.add_row(0, row, |p| p > least);
+            } else {
+                let most = level.ceil() as u8;
+                self.fine.add_row(0, row, |p| p < most);
+            }
+        }
+        self.fine.close();
+    }
+
+    /// Takes the components of `self.crop` over, each as a cutout, or among the rejected.
+    fn collect(
+        &self,
+        frame: &Frame<'_>,
+        parameters: &Parameters,
+        found: &mut Vec<Found>,
+        rejected: &mut Vec<Rejected>,
+    ) {
+        let crop = &self.crop;
+        for (index, c) in self.fine.list.iter().enumerate() {
+            let aoi = Aoi {
+                x: crop.x + c.left as i32,
+                y: crop.y + c.top as i32,
+                width: (c.right - c.left) as u32,
+                height: (c.bottom - c.top) as u32,
+            };
+            let box_area = aoi.width as usize * aoi.height as usize;
+            let reason = if (c.area as f64) < parameters.min_fill * box_area as f64 {
+                Some(Reason::Thread)
+            } else if c.area < parameters.min_area {
+                Some(Reason::Small)
+            } else {
+                None
+            };
+            if let Some(reason) = reason {
+                if c.area >= MIN_REPORTED_AREA {
+                    rejected.push(Rejected { aoi, area: c.area, reason });
+                }
+                continue;
+            }
+            let contact = self.rim_contact(frame, index);
+            let cutout = self.cutout_of(index, c, aoi);
+            found.push(Found { cutout, area: c.area, contact, contrast: crop.contrast });
+        }
+    }
+
+    /// Number of pixels of a fine component on the frame's rim.
+    fn rim_contact(&self, frame: &Frame<'_>, index: usize) -> usize {
+        let crop = &self.crop;
+        let runs = self.fine.runs.iter().filter(|r| r.label == index);
+        runs.map(|r| {
+            let y = crop.y + r.row as i32;
+            if y == 0 || y == frame.height as i32 - 1 {
+                r.end - r.start
+            } else {
+                usize::from(crop.x + r.start as i32 == 0) + usize::from(crop.x + r.end as i32 == frame.width as i32)
+            }
+        })
+        .sum()
+    }
+
+    /// The part of `self.crop` round a fine component, all others made ground.
+    fn cutout_of(&self, index: usize, c: &Component, aoi: Aoi) -> Cutout {
+        let crop = &self.crop;
+        let (left, top) = (c.left.saturating_sub(MARGIN), c.top.saturating_sub(MARGIN));
+        let (right, bottom) = (crop.width.min(c.right + MARGIN), crop.height.min(c.bottom + MARGIN));
+        let width = right - left;
+        let mut pixels = Vec::with_capacity(width * (bottom - top));
+        for y in top..bottom {
+            pixels.extend_from_slice(&crop.pixels[y * crop.width + left..y * crop.width + right]);
+        }
+        let ground = crop.ground_level.round().clamp(0.0, 255.0) as u8;
+        for run in self.fine.runs.iter().filter(|r| r.label != index && (top..bottom).contains(&r.row)) {
+            let (start, end) = (run.start.clamp(left, right), run.end.clamp(left, right));
+            pixels[(run.row - top) * width + start - left..(run.row - top) * width + end - left].fill(ground);
+        }
+        Cutout {
+            aoi,
+            window: Aoi {
+                x: crop.x + left as i32,
+                y: crop.y + top as i32,
+                width: width as u32,
+                height: (bottom - top) as u32,
+            },
+            pixels,
+            shape_level: crop.shape_level,
+            ground_level: crop.ground_level,
+            noise_level: crop.noise_level,
+        }
+    }
+}
+
+/// A shape that may still be rejected beside the others.
+struct Found {
+    cutout: Cutout,
+    area: usize,
+    contact: usize,
+    contrast: f32,
+}
+
+/// Rejects what is cut by the frame, or small or faint beside the other shapes.
+fn sift(frame: &Frame<'_>, parameters: &Parameters, found: Vec<Found>, mut rejected: Vec<Rejected>) -> Segmentation {
+    let total: usize = found.iter().map(|f| f.area).sum();
+    let mut by_area: Vec<(usize, f32)> = found.iter().map(|f| (f.area, f.contrast)).collect();
+    by_area.sort_unstable_by_key(|f| f.0);
+    let mut above = total;
+    let typical_area = by_area
+        .iter()
+        .find(|f| {
+            above -= f.0;
+            above * 2 <= total
+        })
+        .map_or(0, |f| f.0);
+    let typical_contrast = median(by_area.iter().filter(|f| 2 * f.0 >= typical_area).map(|f| f.1).collect());
+    let rim = 2 * (frame.width + frame.height);
+    let mut cutouts = Vec::new();
+    for f in found {
+        let aoi = f.cutout.aoi;
+        let tight = f64::from(aoi.width) >= TIGHT_SPAN * frame.width as f64
+            && f64::from(aoi.height) >= TIGHT_SPAN * frame.height as f64
+            && f.contact as f64 <= TIGHT_CONTACT * rim as f64
+            && f.area as f64 >= TIGHT_SHARE * total as f64;
+        let reason = if (f.area as f64) < parameters.min_relative_area * typical_area as f64 {
+            Some(Reason::Small)
+        } else if f64::from(f.contrast) < parameters.min_relative_contrast * f64::from(typical_contrast) {
+            Some(Reason::Faint)
+        } else if f.contact > 0 && !tight {
+            Some(Reason::CutByFrame)
+        } else {
+            None
+        };
+        match reason {
+            Some(reason) => rejected.push(Rejected { aoi, area: f.area, reason }),
+            None => cutouts.push(f.cutout),
+        }
+    }
+    cutouts.sort_by_key(|c| (c.aoi.y, c.aoi.x));
+    rejected.sort_by_key(|r| (r.aoi.y, r.aoi.x));
+    Segmentation { cutouts, rejected }
+}
+
+/// Contrast of a coarse component against the ground.
+struct Levels {
+    left: usize,
+    top: usize,
+    width: usize,
+    height: usize,
+    /// Median contrast.
+    contrast: f32,
+    /// Contrast of each block of the component's bounding box.
+    map: Vec<f32>,
+    /// Whether one pair of levels will do.
+    uniform: bool,
+    /// 1 for a shape brighter than the ground, -1 for a darker one (grey frames only).
+    sense: f32,
+    /// Whether the sense is the same everywhere.
+    one_sided: bool,
+    /// Ground level (grey frames only).
+    ground: f32,
+}
+
+impl Levels {
+    /// Spreads the levels of the inner blocks out over the box, each block taking the mean of its neighbours that have a level;
+    /// none stays below `least`.
+    fn spread_out(&mut self, least: f32) {
+        let (width, height) = (self.width, self.height);
+        let mut open: Vec<usize> = (0..self.map.len()).filter(|&k| self.map[k] == 0.0).collect();
+        for _ in 0..BORDER_BLOCKS {
+            let filled: Vec<(usize, f32)> = open
+                .iter()
+                .filter_map(|&k| {
+                    let (x, y) = (k % width, k / width);
+                    let (mut sum, mut count) = (0.0, 0.0);
+                    for v in y.saturating_sub(1)..height.min(y + 2) {
+                        for u in x.saturating_sub(1)..width.min(x + 2) {
+                            if self.map[v * width + u] > 0.0 {
+                                sum += self.map[v * width + u];
+                                count += 1.0;
+                            }
+                        }
+                    }
+                    (count > 0.0).then(|| (k, sum / count))
+                })
+                .collect();
+            for (k, level) in filled {
+                self.map[k] = level;
+            }
+            open.retain(|&k| self.map[k] == 0.0);
+        }
+        for level in &mut self.map {
+            *level = if *level == 0.0 { self.contrast } else { level.max(least) };
+        }
+    }
+
+    /// Contrast at a pixel, between the blocks' centres.
+    fn at(&self, x: f32, y: f32) -> f32 {
+        let (u, v) = (x.clamp(0.0, (self.width - 1) as f32), y.clamp(0.0, (self.height - 1) as f32));
+        let (i, j) = (u as usize, v as usize);
+        let (i1, j1) = ((i + 1).min(self.width - 1), (j + 1).min(self.height - 1));
+        let (fu, fv) = (u - i as f32, v - j as f32);
+        let get = |i: usize, j: usize| self.map[j * self.width + i];
+        let top = get(i, j) + (get(i1, j) - get(i, j)) * fu;
+        let bottom = get(i, j1) + (get(i1, j1) - get(i, j1)) * fu;
+        top + (bottom - top) * fv
+    }
+
+    /// Fills a row of pixels with their difference from the ground, divided by the local contrast unless that is uniform.
+    fn fill_row(&self, rows: &RowSource<'_>, (y, from): (usize, usize), out: &mut [u8], levels: [f32; 2]) {
+        let RowSource { frame, ground, block } = *rows;
+        // Block k has its centre at pixel k * block + (block - 1) / 2.
+        let in_blocks = |pixel: usize| (pixel as f64 - (block - 1) as f64 / 2.0) / block as f64;
+        let channels = frame.format.channels();
+        let source = &frame.row(y)[from * channels..];
+        let mut difference = vec![0.0f32; out.len()];
+        let mut ground_levels = vec![0.0f32; out.len()];
+        for (c, surface) in ground.surfaces.iter().enumerate() {
+            surface.fill_line(in_blocks(y), in_blocks(from), 1.0 / block as f64, &mut ground_levels);
+            for ((d, g), p) in difference.iter_mut().zip(&ground_levels).zip(source.iter().skip(c).step_by(channels)) {
+                let signed = f32::from(*p) - g;
+                *d = if self.one_sided { self.sense * signed } else { d.max(signed.abs()) };
+            }
+        }
+        let [shape_level, ground_level] = levels;
+        let row = in_blocks(y) as f32 - self.top as f32;
+        for (i, (out, d)) in out.iter_mut().zip(&difference).enumerate() {
+            let full =
+                if self.uniform { self.contrast } else { self.at(in_blocks(from + i) as f32 - self.left as f32, row) };
+            *out = (ground_level + (shape_level - ground_level) * d / full).round() as u8;
+        }
+    }
+}
+
+/// Where the pixels of a row come from.
+#[derive(Clone, Copy)]
+struct RowSource<'a> {
+    frame: &'a Frame<'a>,
+    ground: &'a Ground,
+    block: usize,
 }

@@ -1,0 +1,336 @@
+//! The ground of a frame: what colour it has where, and what stands out from it.
+//!
+//! The frame is averaged over small blocks. Otsu's threshold on the channel that separates best, and the classes' share of
+//! the frame's outer rows and columns, tell the ground from the shapes. A quadratic surface through the ground's
+//! blocks follows uneven light; what differs from it by more than its scatter is shape.
+
+use super::{Frame, PixelFormat};
+use nalgebra::{Matrix6, Vector6};
+
+/// Means over square blocks of pixels.
+#[derive(Debug, Clone, Default)]
+pub(super) struct Blocks {
+    /// Pixels along the side of a block.
+    pub(super) size: usize,
+    pub(super) columns: usize,
+    pub(super) rows: usize,
+    /// One plane for a grey frame, three for a colour one.
+    pub(super) planes: Vec<Vec<f32>>,
+    sums: Vec<u16>,
+}
+
+impl Blocks {
+    pub(super) fn fill(&mut self, frame: &Frame<'_>) {
+        let channels = frame.format.channels();
+        let (width, height) = (frame.width, frame.height);
+        self.size = block_size(width.min(height));
+        self.columns = width.div_ceil(self.size);
+        self.rows = height.div_ceil(self.size);
+        self.planes.resize_with(channels, Vec::new);
+        for plane in &mut self.planes {
+            plane.clear();
+            plane.reserve(self.columns * self.rows);
+        }
+        for block_row in 0..self.rows {
+            let rows = block_row * self.size..height.min((block_row + 1) * self.size);
+            let count = rows.len();
+            self.sums.clear();
+            self.sums.resize(width * channels, 0);
+            for y in rows {
+                for (sum, p) in self.sums.iter_mut().zip(frame.row(y)) {
+                    *sum += u16::from(*p);
+                }
+            }
+            for (c, plane) in self.planes.iter_mut().enumerate() {
+                match (channels, self.size) {
+                    // The usual sizes are spelt out: the compiler vectorises them.
+                    (1, 4) => mean_of::<4>(&self.sums, count, plane),
+                    (1, 2) => mean_of::<2>(&self.sums, count, plane),
+                    _ => plane.extend(self.sums.chunks(self.size * channels).map(|block| {
+                        let sum: u32 = block.iter().skip(c).step_by(channels).map(|s| u32::from(*s)).sum();
+                        sum as f32 / (block.len() / channels * count) as f32
+                    })),
+                }
+            }
+        }
+    }
+}
+
+fn mean_of<const N: usize>(sums: &[u16], rows: usize, plane: &mut Vec<f32>) {
+    let blocks = sums.chunks_exact(N);
+    let rest = blocks.remainder();
+    let scale = 1.0 / (N * rows) as f32;
+    plane.extend(blocks.map(|b| f32::from(b.iter().sum::<u16>()) * scale));
+    if !rest.is_empty() {
+        plane.push(f32::from(rest.iter().sum::<u16>()) / (rest.len() * rows) as f32);
+    }
+}
+
+/// Side of a block in pixels: small pictures have small shapes.
+fn block_size(frame_side: usize) -> usize {
+    match frame_side {
+        0..128 => 1,
+        128..700 => 2,
+        _ => 4,
+    }
+}
+
+/// A quadratic surface over the frame, in block coordinates scaled to -1..1.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Surface {
+    coefficients: Vector6<f64>,
+    scale: [f64; 2],
+}
+
+impl Surface {
+    fn basis(scale: [f64; 2], column: f64, row: f64) -> Vector6<f64> {
+        let (u, v) = (column * scale[0] - 1.0, row * scale[1] - 1.0);
+        Vector6::new(1.0, u, v, u * u, u * v, v * v)
+    }
+
+    /// Level at a block.
+    pub(super) fn at(&self, column: f64, row: f64) -> f32 {
+        self.coefficients.dot(&Self::basis(self.scale, column, row)) as f32
+    }
+
+    /// Levels along a row, from a column in steps.
+    pub(super) fn fill_line(&self, row: f64, column: f64, step: f64, levels: &mut [f32]) {
+        let c = self.coefficients;
+        let v = row * self.scale[1] - 1.0;
+        let (k0, k1, k2) = (c[0] + v * (c[2] + v * c[5]), c[1] + v * c[4], c[3]);
+        for (i, level) in levels.iter_mut().enumerate() {
+            let u = (column + i as f64 * step) * self.scale[0] - 1.0;
+            *level = (k0 + u * (k1 + u * k2)) as f32;
+        }
+    }
+}
+
+/// The ground and what stands out from it.
+#[derive(Debug, Clone, Default)]
+pub(super) struct Ground {
+    /// Ground level of each channel.
+    pub(super) surfaces: Vec<Surface>,
+    /// By how much each block differs from the ground (largest of the channels), in grey levels.
+    pub(super) residual: Vec<f32>,
+    /// Blocks that differ by more than this belong to shapes.
+    pub(super) threshold: f32,
+}
+
+/// A block that differs from the ground by more than this many standard deviations of the ground's blocks is shape.
+const OUTLIER: f32 = 6.0;
+/// Least difference from the ground, in grey levels: compression leaves traces of a few levels.
+const MIN_RESIDUAL: f32 = 6.0;
+/// Least difference from the ground as a part of what shapes have on the middle: shadows and glare round them have less,
+/// dark print on black more.
+const MIN_RELATIVE_RESIDUAL: f32 = 0.12;
+/// Blocks used for the fit: more do not make a quadratic any better.
+const FIT_SAMPLES: usize = 2_000;
+/// Rounds of fitting the ground and asking again what belongs to it.
+const ROUNDS: usize = 3;
+/// Depths in the frame, as parts of its smaller side, at which rows and columns vote for the ground: beyond scanner edges, and
+/// before most shapes.
+const RIM_DEPTHS: [f64; 4] = [0.0, 0.01, 0.02, 0.04];
+/// Share of the rim from which a class is the ground beyond doubt. In a tight crop of a shape with two straight sides along
+/// the rim about half the rim is shape.
+const SURE_SHARE: f64 = 0.62;
+
+/// A class of blocks taken for ground.
+pub(super) struct Candidate {
+    /// Whether each block is ground.
+    is_ground: Vec<bool>,
+}
+
+/// Which blocks may be ground: one candidate, or both classes where the rim does not tell.
+pub(super) fn candidates(blocks: &Blocks) -> Vec<Candidate> {
+    let mut channels: Vec<Vec<f32>> = Vec::new();
+    let planes = &blocks.planes;
+    if let [r, g, b] = &planes[..] {
+        let combine = |f: fn(f32, f32) -> f32| -> Vec<f32> {
+            r.iter().zip(g).zip(b).map(|((r, g), b)| f(f(*r, *g), *b)).collect()
+        };
+        channels.push(combine(f32::max));
+        channels.push(combine(f32::min));
+        let rim: Vec<usize> = rim_blocks(blocks).collect();
+        let ground: Vec<f32> = planes.iter().map(|p| median(rim.iter().map(|&k| p[k]).collect())).collect();
+        channels.push(
+            (0..r.len())
+                .map(|k| planes.iter().zip(&ground).map(|(p, g)| (p[k] - g).abs()).fold(0.0, f32::max))
+                .collect(),
+        );
+    }
+    let best = planes
+        .iter()
+        .chain(&channels)
+        .map(|channel| (channel, otsu(channel)))
+        .max_by(|a, b| a.1.separation.total_cmp(&b.1.separation));
+    let Some((channel, split)) = best else { return Vec::new() };
+    let (mut bright, mut all) = (0usize, 0usize);
+    for k in rim_blocks(blocks) {
+        bright += usize::from(channel[k] > split.threshold);
+        all += 1;
+    }
+    let share = bright as f64 / all.max(1) as f64;
+    let class =
+        |bright: bool| Candidate { is_ground: channel.iter().map(|v| (*v > split.threshold) == bright).collect() };
+    let likelier = share > 0.5;
+    let mut list = vec![class(likelier)];
+    if share.max(1.0 - share) < SURE_SHARE {
+        list.push(class(!likelier));
+    }
+    list
+}
+
+/// The blocks along the rim, at several depths.
+fn rim_blocks(blocks: &Blocks) -> impl Iterator<Item = usize> {
+    let (columns, rows) = (blocks.columns, blocks.rows);
+    RIM_DEPTHS.into_iter().flat_map(move |depth| {
+        let d = (depth * columns.min(rows) as f64) as usize;
+        let across = (d..columns - d).flat_map(move |c| [d * columns + c, (rows - 1 - d) * columns + c]);
+        let down = (d..rows - d).flat_map(move |r| [r * columns + d, r * columns + columns - 1 - d]);
+        across.chain(down)
+    })
+}
+
+/// Fits the ground to a class of blocks, and finds what stands out from it.
+pub(super) fn fit(blocks: &Blocks, candidate: Candidate) -> Ground {
+    let Candidate { mut is_ground } = candidate;
+    let mut ground = Ground::default();
+    let count = blocks.columns * blocks.rows;
+    let mut levels = vec![0.0; blocks.columns];
+    for _ in 0..ROUNDS {
+        ground.surfaces = blocks.planes.iter().map(|plane| fit_surface(blocks, plane, &is_ground)).collect();
+        ground.residual.clear();
+        ground.residual.resize(count, 0.0);
+        for (plane, surface) in blocks.planes.iter().zip(&ground.surfaces) {
+            let rows = plane.chunks_exact(blocks.columns).zip(ground.residual.chunks_exact_mut(blocks.columns));
+            for (row, (values, residuals)) in rows.enumerate() {
+                surface.fill_line(row as f64, 0.0, 1.0, &mut levels);
+                for ((residual, value), level) in residuals.iter_mut().zip(values).zip(&levels) {
+                    *residual = residual.max((value - level).abs());
+                }
+            }
+        }
+        let stride = (count / (4 * FIT_SAMPLES)).max(1);
+        let scatter: Vec<f32> =
+            (0..count).step_by(stride).filter(|&k| is_ground[k]).map(|k| ground.residual[k]).collect();
+        // The median of absolute residuals is 0.67 standard deviations.
+        let sigma = median(scatter) / 0.6745;
+        let split = otsu(&ground.residual);
+        let standing_out = split.mean_above;
+        ground.threshold = (OUTLIER * sigma).max(MIN_RESIDUAL).max(MIN_RELATIVE_RESIDUAL * standing_out);
+        let half = (standing_out / 2.0).max(ground.threshold);
+        // Whatever is nearer to the ground than to the shapes may be ground, shadows included; the next fit is robust.
+        let mut changed = false;
+        for (is_ground, residual) in is_ground.iter_mut().zip(&ground.residual) {
+            let now = *residual < half;
+            changed |= now != *is_ground;
+            *is_ground = now;
+        }
+        if !changed {
+            break;
+        }
+    }
+    ground
+}
+
+/// Least squares fit of a surface to the ground's blocks, repeated without what lies far from the first fit.
+fn fit_surface(blocks: &Blocks, plane: &[f32], is_ground: &[bool]) -> Surface {
+    let scale = [blocks.columns, blocks.rows].map(|n| 2.0 / (n.max(2) - 1) as f64);
+    let total = is_ground.iter().filter(|g| **g).count();
+    let stride = (total / FIT_SAMPLES).max(1);
+    let samples: Vec<(Vector6<f64>, f64)> = (0..plane.len())
+        .filter(|&k| is_ground[k])
+        .step_by(stride)
+        .map(|k| {
+            let (column, row) = (k % blocks.columns, k / blocks.columns);
+            (Surface::basis(scale, column as f64, row as f64), f64::from(plane[k]))
+        })
+        .collect();
+    let level = f64::from(median(samples.iter().map(|s| s.1 as f32).collect()));
+    let mut surface = Surface { coefficients: Vector6::new(level, 0.0, 0.0, 0.0, 0.0, 0.0), scale };
+    // Between the rounds, samples far from the fit (specks, shadows) are left out: those beyond three deviations.
+    let mut limit = f64::INFINITY;
+    for _ in 0..2 {
+        let mut normal = Matrix6::zeros();
+        let mut right = Vector6::zeros();
+        for (basis, value) in &samples {
+            if (value - surface.coefficients.dot(basis)).abs() <= limit {
+                normal += basis * basis.transpose();
+                right += basis * *value;
+            }
+        }
+        // A tiny ridge: the ground of a tight crop may not determine all coefficients.
+        normal += Matrix6::identity() * (1e-6 * samples.len().max(1) as f64);
+        if let Some(factor) = normal.cholesky() {
+            surface.coefficients = factor.solve(&right);
+        }
+        let residuals = samples.iter().map(|(b, v)| (v - surface.coefficients.dot(b)).abs() as f32).collect();
+        limit = (3.0 / 0.6745 * f64::from(median(residuals))).max(1.0);
+    }
+    surface
+}
+
+/// Two classes of values.
+pub(super) struct Split {
+    pub(super) threshold: f32,
+    /// Between-class part of the variance, 0 to 1.
+    separation: f64,
+    /// Mean of the upper class.
+    mean_above: f32,
+}
+
+/// The threshold that leaves the least variance within two classes (N. Otsu, *A threshold selection method from gray-level
+/// histograms*, IEEE Trans. SMC 9, 1979).
+pub(super) fn otsu(values: &[f32]) -> Split {
+    let mut histogram = [0u32; 256];
+    for v in values {
+        histogram[*v as u8 as usize] += 1;
+    }
+    let total = values.len() as f64;
+    let sum: f64 = histogram.iter().enumerate().map(|(v, n)| v as f64 * f64::from(*n)).sum();
+    let squares: f64 = histogram.iter().enumerate().map(|(v, n)| (v * v) as f64 * f64::from(*n)).sum();
+    let variance = squares / total - (sum / total).powi(2);
+    let mut best = Split { threshold: 255.0, separation: 0.0, mean_above: 255.0 };
+    let (mut below, mut below_sum, mut gain) = (0.0, 0.0, 0.0);
+    for (v, n) in histogram.iter().enumerate() {
+        below += f64::from(*n);
+        below_sum += v as f64 * f64::from(*n);
+        if below == 0.0 || below == total {
+            continue;
+        }
+        let (low, high) = (below_sum / below, (sum - below_sum) / (total - below));
+        let between = below * (total - below) * (high - low).powi(2);
+        if between > gain {
+            gain = between;
+            // Half-way between the class means, rather than at the first of many equally good thresholds.
+            let threshold = ((low + high) / 2.0) as f32;
+            let separation = if variance > 0.0 { between / (total * total) / variance } else { 0.0 };
+            best = Split { threshold, separation, mean_above: high as f32 };
+        }
+    }
+    best
+}
+
+/// Median of a list; 0 of an empty one.
+pub(super) fn median(mut values: Vec<f32>) -> f32 {
+    quantile(&mut values, 0.5)
+}
+
+/// Quantile of a list (which gets reordered); 0 of an empty one.
+pub(super) fn quantile(values: &mut [f32], q: f64) -> f32 {
+    if values.is_empty() {
+        return 0.0;
+    }
+    let k = ((values.len() - 1) as f64 * q) as usize;
+    *values.select_nth_unstable_by(k, f32::total_cmp).1
+}
+
+impl PixelFormat {
+    /// Bytes of a pixel.
+    pub(super) fn channels(self) -> usize {
+        match self {
+            Self::Grey => 1,
+            Self::Rgb => 3,
+        }
+    }
+}

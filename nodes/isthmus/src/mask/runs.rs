@@ -1,0 +1,135 @@
+//! Connected components of a binary picture as runs of pixels (A. Rosenfeld, J. L. Pfaltz, *Sequential operations in digital
+//! picture processing*, J. ACM 13, 1966; on runs, with union-find): one pass, memory linear in the number of runs.
+
+/// Neighbouring pixels of one row.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Run {
+    pub(super) row: usize,
+    pub(super) start: usize,
+    /// One past the last pixel.
+    pub(super) end: usize,
+    /// Index of the component (after [`Components::close`]).
+    pub(super) label: usize,
+}
+
+/// A connected component.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Component {
+    pub(super) area: usize,
+    pub(super) left: usize,
+    pub(super) top: usize,
+    /// One past the right-most column.
+    pub(super) right: usize,
+    /// One past the lowest row.
+    pub(super) bottom: usize,
+}
+
+/// Runs and components, filled row by row.
+#[derive(Debug, Clone, Default)]
+pub(super) struct Components {
+    pub(super) runs: Vec<Run>,
+    pub(super) list: Vec<Component>,
+    parent: Vec<usize>,
+    previous: std::ops::Range<usize>,
+    current: usize,
+    row: usize,
+}
+
+impl Components {
+    pub(super) fn clear(&mut self) {
+        self.runs.clear();
+        self.list.clear();
+        self.parent.clear();
+        self.previous = 0..0;
+        self.current = 0;
+        self.row = 0;
+    }
+
+    /// Begins a row; rows come in order, each once.
+    pub(super) fn begin_row(&mut self, row: usize) {
+        self.previous = self.current..self.runs.len();
+        self.current = self.runs.len();
+        self.row = row;
+    }
+
+    /// Adds the runs of the current row where `set` holds.
+    pub(super) fn add_row<P: Copy>(&mut self, offset: usize, row: &[P], set: impl Fn(P) -> bool) {
+        /// Pixels that are looked at together: most of a row is uniform.
+        const CHUNK: usize = 16;
+        let mut start = None;
+        let mut x = 0;
+        while x < row.len() {
+            if let Some(chunk) = row.get(x..x + CHUNK) {
+                let count = chunk.iter().fold(0u8, |n, &p| n + u8::from(set(p)));
+                if count == if start.is_some() { CHUNK as u8 } else { 0 } {
+                    x += CHUNK;
+                    continue;
+                }
+            }
+            for &p in &row[x..row.len().min(x + CHUNK)] {
+                match (start, set(p)) {
+                    (None, true) => start = Some(x),
+                    (Some(from), false) => {
+                        self.push(offset + from, offset + x);
+                        start = None;
+                    }
+                    _ => {}
+                }
+                x += 1;
+            }
+        }
+        if let Some(from) = start {
+            self.push(offset + from, offset + row.len());
+        }
+    }
+
+    fn push(&mut self, start: usize, end: usize) {
+        let label = self.parent.len();
+        self.parent.push(label);
+        // Runs of the row above that end before this one begins cannot touch a later one either.
+        while self.previous.start < self.previous.end && self.runs[self.previous.start].end <= start {
+            self.previous.start += 1;
+        }
+        for k in self.previous.clone() {
+            if self.runs[k].start >= end {
+                break;
+            }
+            let (a, b) = (self.root(self.runs[k].label), self.root(label));
+            self.parent[a.max(b)] = a.min(b);
+        }
+        self.runs.push(Run { row: self.row, start, end, label });
+    }
+
+    fn root(&mut self, mut node: usize) -> usize {
+        while self.parent[node] != node {
+            self.parent[node] = self.parent[self.parent[node]];
+            node = self.parent[node];
+        }
+        node
+    }
+
+    /// Labels the runs and lists the components, in the order of their first pixel.
+    pub(super) fn close(&mut self) {
+        let mut index = vec![usize::MAX; self.parent.len()];
+        for k in 0..self.runs.len() {
+            let root = self.root(self.runs[k].label);
+            let run = &mut self.runs[k];
+            if index[root] == usize::MAX {
+                index[root] = self.list.len();
+                self.list.push(Component {
+                    area: 0,
+                    left: run.start,
+                    top: run.row,
+                    right: run.end,
+                    bottom: run.row + 1,
+                });
+            }
+            run.label = index[root];
+            let c = &mut self.list[run.label];
+            c.area += run.end - run.start;
+            c.left = c.left.min(run.start);
+            c.right = c.right.max(run.end);
+            c.bottom = run.row + 1;
+        }
+    }
+}
