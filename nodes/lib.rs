@@ -5,3 +5,7 @@
 //! ```
 
 pub mod bag;
+pub mod capture;
+pub mod feature;
+pub mod ros;
+pub mod solver;

@@ -1,0 +1,295 @@
+//! Which piece is which: names of pieces, and pieces that were seen before.
+//!
+//! A name must be the same whenever the same frame is seen again, after a restart as well, and must differ for different
+//! pieces. So it is made from what identifies the frame: the file's name, or the stamp of the message.
+//! A camera that looks at an unmoved table sends every piece again with every frame; one that covers the place of a
+//! known piece of the same topic is that piece.
+
+use std::collections::{HashMap, VecDeque};
+
+use isthmus::mask::{Aoi, Cutout};
+
+/// What identifies a frame.
+#[derive(Debug, Clone, PartialEq, Eq, Hash)]
+pub enum FrameName {
+    /// A file's name without its folder.
+    File(String),
+    /// A topic, and the stamp's seconds and nanoseconds.
+    Stamp(String, i32, u32),
+}
+
+impl FrameName {
+    /// File or topic, as `source` of the messages.
+    pub fn source(&self) -> &str {
+        match self {
+            Self::File(name) | Self::Stamp(name, ..) => name,
+        }
+    }
+
+    fn base(&self) -> String {
+        match self {
+            Self::File(name) => plain(stem(name)),
+            Self::Stamp(_, sec, nanosec) => plain(&format!("{sec}_{nanosec:09}")),
+        }
+    }
+}
+
+fn stem(file: &str) -> &str {
+    file.rsplit_once('.').map_or(file, |(stem, _)| stem)
+}
+
+/// Names become names of coordinate frames, in which a slash would divide and a space confuse.
+fn plain(name: &str) -> String {
+    name.chars().map(|c| if c.is_alphanumeric() || "_-.".contains(c) { c } else { '_' }).collect()
+}
+
+/// Frames that are remembered, so that one seen again gives the same names: some minutes of a camera, and far more
+/// than the frames of any recorded puzzle.
+const FRAMES_KEPT: usize = 8192;
+
+/// Pieces whose places are remembered; four times the largest common puzzle.
+const PIECES_KEPT: usize = 4096;
+
+/// The name of a cutout, and whether it is to be published.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Admission {
+    /// Name of the piece.
+    pub id: String,
+    /// False where a known piece was seen again in the same place.
+    pub publish: bool,
+}
+
+/// The frames and pieces seen so far.
+#[derive(Debug, Default)]
+pub struct Known {
+    frames: HashMap<FrameName, Vec<(u64, Vec<String>)>>,
+    frame_order: VecDeque<FrameName>,
+    files: HashMap<String, String>,
+    places: VecDeque<Place>,
+}
+
+#[derive(Debug)]
+struct Place {
+    id: String,
+    source: String,
+    aoi: Aoi,
+    bits: Vec<u64>,
+    area: u32,
+}
+
+impl Known {
+    /// Names the cutouts of a frame. `content` is a hash of the frame's content; `overlap` the share of area from which
+    /// a piece counts as seen before.
+    pub fn admit(&mut self, frame: &FrameName, content: u64, cutouts: &[Cutout], overlap: f64) -> Vec<Admission> {
+        let seen = self.frames.get(frame);
+        if let Some((_, ids)) =
+            seen.and_then(|all| all.iter().find(|(hash, ids)| (*hash, ids.len()) == (content, cutouts.len())))
+        {
+            // The same frame again (a replay, or a wish to see it again): the same pieces.
+            return ids.iter().map(|id| Admission { id: id.clone(), publish: true }).collect();
+        }
+        let mut base = frame.base();
+        if seen.is_some_and(|all| !all.is_empty()) {
+            // Another frame with the stamp of a known one (some cameras leave it zero).
+            base = format!("{base}_{content:016x}");
+        }
+        if let FrameName::File(name) = frame {
+            match self.files.get(&base) {
+                Some(other) if other != name => base = plain(name),
+                _ => {}
+            }
+            self.files.insert(base.clone(), name.clone());
+        }
+        let admissions: Vec<Admission> = cutouts
+            .iter()
+            .enumerate()
+            .map(|(k, cutout)| {
+                let id = if cutouts.len() == 1 { base.clone() } else { format!("{base}_{k}") };
+                match frame {
+                    FrameName::File(_) => Admission { id, publish: true },
+                    FrameName::Stamp(source, ..) => self.admit_place(source, id, cutout, overlap),
+                }
+            })
+            .collect();
+        self.remember(frame, content, &admissions);
+        admissions
+    }
+
+    fn admit_place(&mut self, source: &str, id: String, cutout: &Cutout, overlap: f64) -> Admission {
+        let place = Place::new(id, source, cutout);
+        if let Some(known) = self.places.iter().find(|known| known.overlap(&place) >= overlap) {
+            return Admission { id: known.id.clone(), publish: false };
+        }
+        let id = place.id.clone();
+        if self.places.len() >= PIECES_KEPT {
+            self.places.pop_front();
+        }
+        self.places.push_back(place);
+        Admission { id, publish: true }
+    }
+
+    fn remember(&mut self, frame: &FrameName, content: u64, admissions: &[Admission]) {
+        let ids = admissions.iter().map(|a| a.id.clone()).collect();
+        self.frames.entry(frame.clone()).or_default().push((content, ids));
+        self.frame_order.push_back(frame.clone());
+        if self.frame_order.len() > FRAMES_KEPT
+            && let Some(oldest) = self.frame_order.pop_front()
+            && let Some(contents) = self.frames.get_mut(&oldest)
+        {
+            contents.remove(0);
+            if contents.is_empty() {
+                self.frames.remove(&oldest);
+            }
+        }
+    }
+}
+
+impl Place {
+    fn new(id: String, source: &str, cutout: &Cutout) -> Self {
+        let Aoi { width, height, .. } = cutout.aoi;
+        let mut place = Self {
+            id,
+            source: source.to_owned(),
+            aoi: cutout.aoi,
+            bits: vec![0; (width as usize * height as usize).div_ceil(64)],
+            area: 0,
+        };
+        let threshold = (cutout.shape_level + cutout.ground_level) / 2.0;
+        let bright = cutout.shape_level > cutout.ground_level;
+        let left = (cutout.aoi.x - cutout.window.x).max(0) as usize;
+        let top = (cutout.aoi.y - cutout.window.y).max(0) as usize;
+        for row in 0..height as usize {
+            let start = (top + row) * cutout.window.width as usize + left;
+            let Some(pixels) = cutout.pixels.get(start..start + width as usize) else { break };
+            for (column, &pixel) in pixels.iter().enumerate() {
+                if (f32::from(pixel) > threshold) == bright {
+                    let bit = row * width as usize + column;
+                    place.bits[bit / 64] |= 1 << (bit % 64);
+                    place.area += 1;
+                }
+            }
+        }
+        place
+    }
+
+    fn covers(&self, x: i32, y: i32) -> bool {
+        let (column, row) = (x - self.aoi.x, y - self.aoi.y);
+        if column < 0 || row < 0 || column as u32 >= self.aoi.width || row as u32 >= self.aoi.height {
+            return false;
+        }
+        let bit = row as usize * self.aoi.width as usize + column as usize;
+        self.bits[bit / 64] >> (bit % 64) & 1 == 1
+    }
+
+    /// Intersection over union of the two areas; 0 for pieces of different topics.
+    fn overlap(&self, other: &Self) -> f64 {
+        let (smaller, larger) = (self.area.min(other.area), self.area.max(other.area));
+        // The overlap can't exceed the ratio of the areas; the boxes must meet to have one at all.
+        if self.source != other.source || smaller == 0 || !meet(&self.aoi, &other.aoi) || smaller < larger / 2 {
+            return 0.0;
+        }
+        let mut both = 0_u32;
+        for y in self.aoi.y..self.aoi.y + self.aoi.height as i32 {
+            for x in self.aoi.x..self.aoi.x + self.aoi.width as i32 {
+                both += u32::from(self.covers(x, y) && other.covers(x, y));
+            }
+        }
+        f64::from(both) / f64::from(self.area + other.area - both)
+    }
+}
+
+/// Whether most of two boxes is common to both.
+fn meet(a: &Aoi, b: &Aoi) -> bool {
+    let common = |a0: i32, a1: u32, b0: i32, b1: u32| {
+        let (a0, b0) = (i64::from(a0), i64::from(b0));
+        (a0 + i64::from(a1)).min(b0 + i64::from(b1)) - a0.max(b0)
+    };
+    let half = |length: u32| i64::from(length / 2);
+    common(a.x, a.width, b.x, b.width) > half(a.width.max(b.width))
+        && common(a.y, a.height, b.y, b.height) > half(a.height.max(b.height))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const OVERLAP: f64 = 0.97;
+
+    /// A disc of this radius.
+    fn disc(x: i32, y: i32, radius: i32) -> Cutout {
+        let size = (2 * radius + 1) as u32;
+        let aoi = Aoi { x: x - radius, y: y - radius, width: size, height: size };
+        let pixels = (-radius..=radius)
+            .flat_map(|v| (-radius..=radius).map(move |u| if u * u + v * v <= radius * radius { 20 } else { 230 }))
+            .collect();
+        Cutout { aoi, window: aoi, pixels, shape_level: 20.0, ground_level: 230.0, noise_level: 1.0 }
+    }
+
+    fn stamp(sec: i32) -> FrameName {
+        FrameName::Stamp("/image".to_owned(), sec, 5)
+    }
+
+    fn ids(admissions: &[Admission]) -> Vec<(&str, bool)> {
+        admissions.iter().map(|a| (a.id.as_str(), a.publish)).collect()
+    }
+
+    #[test]
+    fn names_come_from_stamp_or_file() {
+        let mut known = Known::default();
+        let one = [disc(100, 100, 40)];
+        let two = [disc(100, 300, 40), disc(300, 300, 50)];
+        assert_eq!(ids(&known.admit(&stamp(1), 1, &one, OVERLAP)), [("1_000000005", true)]);
+        assert_eq!(ids(&known.admit(&stamp(2), 2, &two, OVERLAP)), [("2_000000005_0", true), ("2_000000005_1", true)]);
+        let file = FrameName::File("my piece/1.png".to_owned());
+        assert_eq!(ids(&known.admit(&file, 3, &one, OVERLAP)), [("my_piece_1", true)]);
+    }
+
+    #[test]
+    fn a_frame_seen_again_gives_the_same_names() {
+        let (mut first, mut restarted) = (Known::default(), Known::default());
+        let frame = [disc(100, 100, 40), disc(300, 300, 50)];
+        let before = first.admit(&stamp(1), 7, &frame, OVERLAP);
+        assert_eq!(first.admit(&stamp(1), 7, &frame, OVERLAP), before);
+        assert_eq!(restarted.admit(&stamp(1), 7, &frame, OVERLAP), before);
+    }
+
+    #[test]
+    fn a_piece_that_stays_is_published_once() {
+        let mut known = Known::default();
+        let first = known.admit(&stamp(1), 1, &[disc(100, 100, 60)], OVERLAP);
+        let again = known.admit(&stamp(2), 2, &[disc(100, 101, 60), disc(300, 100, 60)], OVERLAP);
+        assert_eq!(ids(&again), [(first[0].id.as_str(), false), ("2_000000005_1", true)]);
+        let other_size = known.admit(&stamp(3), 3, &[disc(100, 100, 50)], OVERLAP);
+        assert_eq!(ids(&other_size), [("3_000000005", true)]);
+        let other_topic = FrameName::Stamp("/other".to_owned(), 3, 5);
+        assert!(known.admit(&other_topic, 3, &[disc(100, 100, 60)], OVERLAP)[0].publish);
+    }
+
+    #[test]
+    fn equal_stamps_with_other_content_are_told_apart() {
+        let mut known = Known::default();
+        let first = known.admit(&stamp(0), 1, &[disc(100, 100, 40)], OVERLAP);
+        let second = known.admit(&stamp(0), 2, &[disc(300, 100, 40)], OVERLAP);
+        assert_ne!(first[0].id, second[0].id);
+        assert!(second[0].publish);
+        assert_eq!(known.admit(&stamp(0), 2, &[disc(300, 100, 40)], OVERLAP), second);
+    }
+
+    #[test]
+    fn files_of_one_stem_are_told_apart() {
+        let mut known = Known::default();
+        let name = |file: &str| FrameName::File(file.to_owned());
+        let first = known.admit(&name("a.png"), 1, &[disc(100, 100, 40)], OVERLAP);
+        let second = known.admit(&name("a.jpg"), 2, &[disc(100, 100, 40)], OVERLAP);
+        assert_eq!((first[0].id.as_str(), second[0].id.as_str()), ("a", "a.jpg"));
+    }
+
+    #[test]
+    fn memory_is_bounded() {
+        let mut known = Known::default();
+        for sec in 0..(FRAMES_KEPT as i32 + 100) {
+            known.admit(&stamp(sec), 1, &[], OVERLAP);
+        }
+        assert_eq!((known.frames.len(), known.frame_order.len()), (FRAMES_KEPT, FRAMES_KEPT));
+    }
+}

@@ -1,0 +1,211 @@
+//! Capture node: frames in, pieces out.
+//!
+//! A frame is decoded and cut into pieces in worker threads, some frames at a time, in order; [`known`] names the
+//! pieces and leaves out those seen before; the rest is published. A frame that can't be used is refused with one
+//! (throttled) line and counted, and the next one is taken.
+
+pub mod convert;
+pub mod known;
+pub mod params;
+pub mod source;
+
+use std::sync::Arc;
+
+use futures::channel::mpsc;
+use futures::stream::{self, BoxStream};
+use futures::{Sink, SinkExt, Stream, StreamExt};
+use isthmus::mask::{self, Cutout};
+use jigsaw_msgs::msg::PieceImage;
+use jigsaw_msgs::std_srvs::srv::{Trigger, TriggerResponse};
+
+use crate::ros::health::Health;
+use crate::ros::params::Parameters;
+use crate::ros::process::{ProcessError, Program, Work};
+use crate::ros::session::{Call, Session};
+use crate::ros::topics;
+use convert::{FrameError, FrameHead};
+use known::{FrameName, Known};
+use source::Frame;
+
+/// The program of this node.
+pub const PROGRAM: Program = Program {
+    name: "capture_node",
+    about: "Cuts camera frames into jigsaw pieces.\n\n\
+            Topics in:  image (sensor_msgs/Image), image/compressed (sensor_msgs/CompressedImage)\n\
+            Topic out:  pieces/image (jigsaw_msgs/PieceImage)\n\
+            Service:    capture (std_srvs/Trigger): take the pieces in view, or the folder, again",
+    parameters: params::PARAMETERS,
+};
+
+/// What the loop needs beside its streams.
+#[derive(Debug, Clone)]
+pub struct Settings {
+    /// Parameters, looked at with every frame.
+    pub parameters: Arc<Parameters>,
+    /// Counters.
+    pub health: Arc<Health>,
+}
+
+/// A frame after the workers.
+struct Seen {
+    name: FrameName,
+    content: u64,
+    head: FrameHead,
+    cutouts: Vec<Cutout>,
+}
+
+/// Opens the topics and services of the node and gives its loop, which sends the pieces to `pieces`.
+///
+/// # Errors
+/// An empty or missing folder; a name that is no name; a refusal of the middleware.
+pub fn open(mut session: Session, pieces: impl Sink<PieceImage> + Unpin + 'static) -> Result<Work, ProcessError> {
+    let settings = Settings { parameters: Arc::clone(&session.parameters), health: Arc::clone(&session.health) };
+    let calls = session.serve::<Trigger>(topics::CAPTURE_SERVICE)?;
+    let frames: BoxStream<'static, Frame> = match params::source_folder(&session.parameters) {
+        Some(folder) => {
+            let files = source::pictures(&folder)
+                .map_err(|e| ProcessError::Configuration(format!("parameter '{}': {e}", params::SOURCE.name)))?;
+            log::info!("{} pictures in {}", files.len(), folder.display());
+            stream::iter(files.into_iter().map(Frame::File)).boxed()
+        }
+        None => {
+            let (raw_name, compressed_name) =
+                (session.names().topic(topics::IMAGE.name)?, session.names().topic(topics::IMAGE_COMPRESSED.name)?);
+            let best_effort = session.parameters.text(&params::COMPRESSED_RELIABILITY) == "best_effort";
+            let raw = session.subscribe(&topics::IMAGE)?;
+            let compressed = session.subscribe(if best_effort {
+                &topics::IMAGE_COMPRESSED_BEST_EFFORT
+            } else {
+                &topics::IMAGE_COMPRESSED
+            })?;
+            stream::select(
+                raw.map(move |image| Frame::Raw(raw_name.clone(), image)),
+                compressed.map(move |image| Frame::Compressed(compressed_name.clone(), image)),
+            )
+            .boxed()
+        }
+    };
+    Ok(Box::pin(async move {
+        // The session is kept: its topics and services end with it.
+        run(frames, calls, pieces, settings).await;
+        drop(session);
+        Ok(())
+    }))
+}
+
+/// The node's loop. Ends when frames and calls have ended.
+pub async fn run(
+    frames: impl Stream<Item = Frame> + Unpin,
+    calls: impl Stream<Item = Call<Trigger>> + Unpin,
+    mut pieces: impl Sink<PieceImage> + Unpin,
+    settings: Settings,
+) {
+    let Settings { parameters, health } = settings;
+    let threads = params::threads(&parameters, &params::THREADS);
+    // Files that a call wants read again come in beside the frames.
+    let (again, more) = mpsc::unbounded();
+    let mut again = Some(again);
+    let mut seen = stream::select(frames, more).map(|frame| smol::unblock(move || cut_out(frame))).buffered(threads);
+    let mut calls = calls.fuse();
+    let mut known = Known::default();
+    let mut latest: Vec<PieceImage> = Vec::new();
+    loop {
+        futures::select! {
+            frame = seen.next() => match frame {
+                Some(Ok(frame)) => {
+                    health.received();
+                    latest = name_pieces(&mut known, frame, &parameters, &health, &mut pieces).await;
+                }
+                Some(Err(refusal)) => health.refuse(refusal.kind(), &refusal.to_string()),
+                None => break,
+            },
+            call = calls.next() => match call {
+                Some(call) => {
+                    let answer = match (params::source_folder(&parameters), &again) {
+                        (Some(folder), Some(again)) => reread(&folder, again),
+                        _ => publish_again(&latest, &health, &mut pieces).await,
+                    };
+                    // The caller may have gone; that is no concern of the node.
+                    let _ = call.reply.send(answer);
+                }
+                None => again = None,
+            },
+            complete => break,
+        }
+    }
+}
+
+/// Names the pieces of a frame, publishes the new ones, and gives all of them for the `capture` service.
+async fn name_pieces(
+    known: &mut Known,
+    frame: Seen,
+    parameters: &Parameters,
+    health: &Health,
+    pieces: &mut (impl Sink<PieceImage> + Unpin),
+) -> Vec<PieceImage> {
+    let overlap = parameters.double(&params::SAME_PLACE_OVERLAP);
+    let metres_per_pixel = parameters.double(&params::METRES_PER_PIXEL);
+    let admissions = known.admit(&frame.name, frame.content, &frame.cutouts, overlap);
+    let mut all = Vec::with_capacity(admissions.len());
+    for (admission, cutout) in admissions.into_iter().zip(frame.cutouts) {
+        let piece = convert::piece_message(admission.id, &frame.head, cutout, metres_per_pixel);
+        if admission.publish {
+            log::debug!("piece {} in {}", piece.id, piece.source);
+            send(piece.clone(), health, pieces).await;
+        }
+        all.push(piece);
+    }
+    health.state("taking frames");
+    all
+}
+
+async fn send(piece: PieceImage, health: &Health, pieces: &mut (impl Sink<PieceImage> + Unpin)) {
+    if pieces.send(piece).await.is_ok() {
+        health.published();
+    }
+}
+
+async fn publish_again(
+    latest: &[PieceImage],
+    health: &Health,
+    pieces: &mut (impl Sink<PieceImage> + Unpin),
+) -> TriggerResponse {
+    for piece in latest {
+        send(piece.clone(), health, pieces).await;
+    }
+    match latest.len() {
+        0 => TriggerResponse { success: false, message: "no frame with a piece has come in yet".to_owned() },
+        n => TriggerResponse { success: true, message: format!("{n} pieces of the latest frame published again") },
+    }
+}
+
+fn reread(folder: &std::path::Path, again: &mpsc::UnboundedSender<Frame>) -> TriggerResponse {
+    match source::pictures(folder) {
+        Ok(files) => {
+            let message = format!("{} pictures of {} are read again", files.len(), folder.display());
+            let sent = files.into_iter().try_for_each(|file| again.unbounded_send(Frame::File(file)));
+            TriggerResponse { success: sent.is_ok(), message }
+        }
+        Err(e) => TriggerResponse { success: false, message: e.to_string() },
+    }
+}
+
+/// The work on one frame that is done beside the loop: reading and segmentation.
+fn cut_out(frame: Frame) -> Result<Seen, FrameError> {
+    let picture = convert::picture(frame)?;
+    let source = picture.name.source().to_owned();
+    let (width, height) = (picture.pixels.width(), picture.pixels.height());
+    let no_piece = |reason: String| FrameError::NoPiece { source_name: source.clone(), reason };
+    let pixels = convert::Pixels::from(picture.pixels);
+    let frame = pixels.frame().map_err(|e| no_piece(e.to_string()))?;
+    let segmentation = mask::segment(&frame, &mask::Parameters::default());
+    if segmentation.cutouts.is_empty() {
+        return Err(no_piece(convert::why_empty(&segmentation)));
+    }
+    Ok(Seen {
+        name: picture.name,
+        content: picture.content,
+        head: FrameHead { header: picture.header, source, width, height },
+        cutouts: segmentation.cutouts,
+    })
+}

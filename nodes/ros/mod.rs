@@ -1,0 +1,23 @@
+//! Middleware glue: everything that knows DDS, and nothing that knows jigsaw puzzles beyond the names of the topics.
+//!
+//! | module | what stands there, and nowhere else |
+//! | --- | --- |
+//! | [`args`] | the command line of ROS: remapping, parameters, names |
+//! | [`params`] | declaration, check and documentation of parameters |
+//! | [`services`] | the six parameter services |
+//! | [`topics`] | every topic: message type, name, quality of service |
+//! | [`session`] | one node: opens topics and services as streams and sinks |
+//! | [`process`] | one process: signals, participant, watchdog, exit code |
+//! | [`logging`] | log lines to the console and `/rosout`, throttled warnings |
+//! | [`health`] | counters of a node, published as `/diagnostics` |
+//! | [`transforms`] | pixels (y down) to metres (y up) |
+
+pub mod args;
+pub mod health;
+pub mod logging;
+pub mod params;
+pub mod process;
+pub mod services;
+pub mod session;
+pub mod topics;
+pub mod transforms;

@@ -1,0 +1,448 @@
+//! One process: command line, signals, DDS participant, nodes, watchdog, exit code.
+//!
+//! | exit code | meaning |
+//! | --- | --- |
+//! | 0 | ended by SIGINT or SIGTERM, or done |
+//! | 1 | the middleware could not be opened |
+//! | 2 | bad command line, parameter or environment; one line says what |
+//! | 3 | the node had gone deaf (see below) and is to be started again |
+//!
+//! **Signals** are blocked on every thread, and one thread waits for them. A handler that ran on one of RustDDS's own
+//! threads would interrupt its poll, after which that thread ends for good and the node lives on deaf. SIGSTOP and
+//! SIGCONT interrupt polls all the same; so a **watchdog** looks whether RustDDS's threads still live and ends the
+//! process where one has gone, so that whoever started it starts it again.
+
+use std::net::IpAddr;
+use std::process::ExitCode;
+use std::rc::Rc;
+use std::sync::Arc;
+use std::time::Duration;
+
+use futures::future::LocalBoxFuture;
+use futures::{FutureExt, SinkExt, StreamExt};
+use jigsaw_msgs::diagnostic_msgs::msg::DiagnosticArray;
+use jigsaw_msgs::std_msgs::msg::Header;
+use nix::sys::signal::{SigSet, Signal};
+use ros2_client::{Context, NodeName, NodeOptions};
+use rustdds::dds::statusevents::{DomainParticipantStatusEvent, StatusEvented};
+use rustdds::{DomainParticipant, DomainParticipantBuilder};
+
+use super::args::{ArgsError, RosArgs, domain_id};
+use super::health::Health;
+use super::params::{Default as DefaultValue, ParameterError, Parameters, Rule, Spec};
+use super::session::{Clock, Endpoints, Session, SessionError};
+use super::{logging, services, topics};
+
+/// Whether the time comes from `/clock`.
+pub const USE_SIM_TIME: Spec = Spec {
+    name: "use_sim_time",
+    default: DefaultValue::Bool(false),
+    unit: "",
+    rule: Rule::Any,
+    description: "Take the time from /clock instead of the system.",
+    read_only: false,
+};
+
+/// Which interfaces the middleware uses.
+pub const NETWORK_INTERFACES: Spec = Spec {
+    name: "network_interfaces",
+    default: DefaultValue::Texts(&[]),
+    unit: "",
+    rule: Rule::Texts("IP addresses of this host", |text| text.parse::<IpAddr>().is_ok()),
+    description: "Addresses of the network interfaces to talk through; all of them if empty, 127.0.0.1 for this host alone.",
+    read_only: true,
+};
+
+/// The parameters every node has.
+pub const COMMON_PARAMETERS: &[Spec] = &[USE_SIM_TIME, NETWORK_INTERFACES];
+
+/// How often the watchdog looks.
+const WATCH_PERIOD: Duration = Duration::from_millis(500);
+
+/// How often a node reports.
+const REPORT_PERIOD: Duration = Duration::from_secs(1);
+
+/// How long an ordered end may take after a signal; then the process ends anyway, so that whoever sent the signal
+/// need not kill it.
+const END_PATIENCE: Duration = Duration::from_millis(800);
+
+/// Beginning of the names of RustDDS's threads.
+const MIDDLEWARE_THREADS: &str = "RustDDS";
+
+/// Why a process ends, other than by a signal.
+#[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
+pub enum ProcessError {
+    /// The command line or the environment.
+    #[error(transparent)]
+    Args(#[from] ArgsError),
+    /// A parameter's start-up value.
+    #[error(transparent)]
+    Parameter(#[from] ParameterError),
+    /// The configuration of a node, beyond the rules of single parameters.
+    #[error("{0}")]
+    Configuration(String),
+    /// The middleware, or a name.
+    #[error(transparent)]
+    Session(#[from] SessionError),
+    /// The system.
+    #[error("{what}: {reason}")]
+    System {
+        /// What was tried.
+        what: &'static str,
+        /// The system's words.
+        reason: String,
+    },
+    /// A thread of the middleware has ended.
+    #[error("the middleware has gone deaf (its thread '{0}' ended, as it does after SIGSTOP); start this node again")]
+    Deaf(String),
+}
+
+impl ProcessError {
+    /// The exit code of the process.
+    pub fn exit_code(&self) -> u8 {
+        match self {
+            Self::Args(_) | Self::Parameter(_) | Self::Configuration(_) | Self::Session(SessionError::Name(_)) => 2,
+            Self::Session(_) | Self::System { .. } => 1,
+            Self::Deaf(_) => 3,
+        }
+    }
+}
+
+/// What a program is, for `--help`.
+#[derive(Debug, Clone, Copy)]
+pub struct Program {
+    /// Name of the binary and of the node.
+    pub name: &'static str,
+    /// What it does, its topics and services.
+    pub about: &'static str,
+    /// Its parameters.
+    pub parameters: &'static [Spec],
+}
+
+/// The work of a process: what runs until it is done or a signal comes.
+pub type Work = LocalBoxFuture<'static, Result<(), ProcessError>>;
+
+/// Runs a program of one node: its whole `main`.
+pub fn main(program: Program, open: impl FnOnce(Session) -> Result<Work, ProcessError>) -> ExitCode {
+    let args: Vec<String> = std::env::args().skip(1).collect();
+    if args.iter().any(|a| a == "--help" || a == "-h") {
+        println!("{}", help(&program));
+        return ExitCode::SUCCESS;
+    }
+    if args.iter().any(|a| a == "--version" || a == "-V") {
+        println!("{} {}", program.name, env!("CARGO_PKG_VERSION"));
+        return ExitCode::SUCCESS;
+    }
+    let result = Process::start(program.name, args).and_then(|process| {
+        if let Some(unknown) = process.args.rest.first() {
+            return Err(ProcessError::Configuration(format!(
+                "unknown argument '{unknown}': ROS arguments stand behind --ros-args (see --help)"
+            )));
+        }
+        process.run(|process| open(process.node(program.name, program.parameters)?))
+    });
+    exit_code(program.name, result)
+}
+
+/// Says what went wrong, in one line, and gives the exit code for it.
+pub fn exit_code(program: &str, result: Result<(), ProcessError>) -> ExitCode {
+    match result {
+        Ok(()) => ExitCode::SUCCESS,
+        Err(error) => {
+            eprintln!("{program}: {error}");
+            ExitCode::from(error.exit_code())
+        }
+    }
+}
+
+fn help(program: &Program) -> String {
+    let mut text = format!(
+        "{}\n\nUsage: {} [--ros-args [-r FROM:=TO] [-p NAME:=VALUE] [--params-file FILE]\n       \
+         [-r __ns:=/NAMESPACE] [-r __node:=NAME] [--log-level LEVEL] [--]]\n\n\
+         Environment: ROS_DOMAIN_ID, ROS_LOCALHOST_ONLY, ROS_AUTOMATIC_DISCOVERY_RANGE, RUST_LOG\n\nParameters:\n",
+        program.about, program.name
+    );
+    for spec in program.parameters.iter().chain(COMMON_PARAMETERS) {
+        let unit = if spec.unit.is_empty() { String::new() } else { format!(" {}", spec.unit) };
+        let rule = Some(spec.rule_text()).filter(|r| !r.is_empty()).map(|r| format!("; {r}")).unwrap_or_default();
+        text.push_str(&format!(
+            "  {} ({} = {}{unit}{rule})\n      {}\n",
+            spec.name,
+            spec.type_name(),
+            super::params::show(&spec.default_value()),
+            spec.description
+        ));
+    }
+    text
+}
+
+/// A process before and while it runs.
+pub struct Process {
+    /// Its command line.
+    pub args: RosArgs,
+    name: &'static str,
+    executor: Rc<smol::LocalExecutor<'static>>,
+    endpoints: Endpoints,
+    participant: Option<(DomainParticipant, Context)>,
+}
+
+impl Process {
+    /// Blocks the signals, reads the command line and starts logging. To be called before any thread is started.
+    ///
+    /// # Errors
+    /// A bad command line.
+    pub fn start(name: &'static str, args: impl IntoIterator<Item = impl Into<String>>) -> Result<Self, ProcessError> {
+        signals()
+            .thread_block()
+            .map_err(|e| ProcessError::System { what: "blocking signals", reason: e.to_string() })?;
+        let args = RosArgs::parse(args)?;
+        logging::start(name, &args);
+        Ok(Self {
+            args,
+            name,
+            executor: Rc::new(smol::LocalExecutor::new()),
+            endpoints: Endpoints::default(),
+            participant: None,
+        })
+    }
+
+    /// Opens a node with its parameters, their services, its clock and its report.
+    ///
+    /// # Errors
+    /// A bad name or parameter, or a refusal of the middleware.
+    pub fn node(&mut self, name: &str, parameters: &'static [Spec]) -> Result<Session, ProcessError> {
+        let names = self.args.node("/", name)?;
+        let table = Arc::new(Parameters::declare(&names.full_name(), &[parameters, COMMON_PARAMETERS]));
+        table.start_with(&self.args.overrides(&names))?;
+        let context = self.context(&table)?;
+        let node_name = NodeName::new(names.namespace(), names.name())
+            .map_err(|e| SessionError::middleware(format!("node {}", names.full_name()), e))?;
+        // Parameters are served from our own table; the library's services know neither ranges nor descriptions.
+        let options = NodeOptions::new().start_parameter_services(false).enable_rosout(self.args.rosout);
+        let node = context
+            .new_node(node_name, options)
+            .map_err(|e| SessionError::middleware(format!("node {}", names.full_name()), e))?;
+        logging::add_node(name, node.logging_handle());
+        let health = Arc::new(Health::new(&names.full_name()));
+        let mut session = Session {
+            context,
+            node,
+            names,
+            executor: Rc::clone(&self.executor),
+            endpoints: self.endpoints.clone(),
+            parameters: table,
+            health,
+            clock: Clock::default(),
+        };
+        services::open(&mut session)?;
+        follow_clock(&mut session)?;
+        report(&mut session)?;
+        Ok(session)
+    }
+
+    /// Runs the work that `open` makes until it is done, a signal comes or the middleware dies.
+    ///
+    /// # Errors
+    /// What went wrong while opening or running.
+    pub fn run(mut self, open: impl FnOnce(&mut Self) -> Result<Work, ProcessError>) -> Result<(), ProcessError> {
+        let work = open(&mut self)?;
+        let (signal, signalled) = futures::channel::oneshot::channel();
+        std::thread::Builder::new()
+            .name("signals".to_owned())
+            .spawn(move || {
+                if let Ok(received) = signals().wait() {
+                    log::info!("{received}: ending");
+                    let _ = signal.send(());
+                    std::thread::sleep(END_PATIENCE);
+                    std::process::exit(0);
+                }
+            })
+            .map_err(|e| ProcessError::System { what: "starting a thread", reason: e.to_string() })?;
+        if let Some((participant, _)) = &self.participant {
+            self.executor.spawn(follow_discovery(participant.clone(), self.endpoints.clone())).detach();
+        }
+        log::info!("{} is ready", self.name);
+        let executor = Rc::clone(&self.executor);
+        let result = smol::block_on(executor.run(async {
+            futures::select! {
+                result = work.fuse() => result,
+                _ = signalled.fuse() => Ok(()),
+                error = watchdog().fuse() => Err(error),
+            }
+        }));
+        logging::remove_nodes();
+        if matches!(result, Err(ProcessError::Deaf(_))) {
+            // A dead participant can't be taken down in order; its drop would wait for the dead thread.
+            if let Err(error) = &result {
+                eprintln!("{}: {error}", self.name);
+                std::process::exit(i32::from(error.exit_code()));
+            }
+        }
+        result
+    }
+
+    /// The DDS participant, which all nodes of the process share; opened with the parameters of the first of them.
+    fn context(&mut self, parameters: &Parameters) -> Result<Context, ProcessError> {
+        if let Some((_, context)) = &self.participant {
+            return Ok(context.clone());
+        }
+        let domain = domain_id(std::env::var("ROS_DOMAIN_ID").ok().as_deref())?;
+        let mut builder = DomainParticipantBuilder::new(domain);
+        let addresses = interfaces(parameters, |variable| std::env::var(variable).ok())?;
+        if !addresses.is_empty() {
+            log::debug!("network interfaces: {addresses:?}");
+            builder = builder.with_only_networks(addresses);
+        }
+        let participant = builder.build().map_err(|e| SessionError::middleware(format!("DDS domain {domain}"), e))?;
+        let context = Context::from_domain_participant(participant.clone())
+            .map_err(|e| SessionError::middleware(format!("DDS domain {domain}"), e))?;
+        self.participant = Some((participant, context.clone()));
+        Ok(context)
+    }
+}
+
+fn signals() -> SigSet {
+    let mut signals = SigSet::empty();
+    signals.add(Signal::SIGINT);
+    signals.add(Signal::SIGTERM);
+    signals
+}
+
+/// The addresses that the parameter or the environment restricts the middleware to; none for no restriction.
+fn interfaces(
+    parameters: &Parameters,
+    environment: impl Fn(&'static str) -> Option<String>,
+) -> Result<Vec<IpAddr>, ArgsError> {
+    let loopback = vec![IpAddr::from([127, 0, 0, 1])];
+    let given: Vec<IpAddr> =
+        parameters.texts(&NETWORK_INTERFACES).iter().filter_map(|text| text.parse().ok()).collect();
+    if !given.is_empty() {
+        return Ok(given);
+    }
+    if environment("ROS_LOCALHOST_ONLY").as_deref() == Some("1") {
+        return Ok(loopback);
+    }
+    match environment("ROS_AUTOMATIC_DISCOVERY_RANGE").as_deref() {
+        None | Some("" | "SUBNET" | "SYSTEM_DEFAULT") => Ok(Vec::new()),
+        Some("LOCALHOST" | "OFF") => Ok(loopback),
+        Some(other) => Err(ArgsError::Environment {
+            variable: "ROS_AUTOMATIC_DISCOVERY_RANGE",
+            value: other.to_owned(),
+            rule: "must be one of SUBNET, LOCALHOST, OFF, SYSTEM_DEFAULT",
+        }),
+    }
+}
+
+/// Keeps the session's clock at `/clock` while `use_sim_time` is set.
+fn follow_clock(session: &mut Session) -> Result<(), SessionError> {
+    let mut ticks = session.subscribe(&topics::CLOCK)?;
+    let (clock, parameters) = (session.clock.clone(), Arc::clone(&session.parameters));
+    let mut changes = parameters.changes();
+    let simulated = parameters.bool(&USE_SIM_TIME);
+    clock.set(simulated.then(Default::default));
+    session.spawn(async move {
+        loop {
+            futures::select! {
+                tick = ticks.next() => match tick {
+                    Some(tick) if parameters.bool(&USE_SIM_TIME) => clock.set(Some(tick.clock)),
+                    Some(_) => {}
+                    None => break,
+                },
+                change = changes.next() => match (change, parameters.bool(&USE_SIM_TIME)) {
+                    (None, _) => break,
+                    (Some(()), false) => clock.set(None),
+                    (Some(()), true) => clock.begin_simulation(),
+                },
+            }
+        }
+    });
+    Ok(())
+}
+
+/// Publishes the session's report.
+fn report(session: &mut Session) -> Result<(), SessionError> {
+    let (mut diagnostics, _) = session.publish(&topics::DIAGNOSTICS)?;
+    let (health, clock) = (Arc::clone(&session.health), session.clock.clone());
+    session.spawn(async move {
+        let mut ticks = smol::Timer::interval(REPORT_PERIOD);
+        while ticks.next().await.is_some() {
+            let header = Header { stamp: clock.now(), frame_id: String::new() };
+            if diagnostics.send(DiagnosticArray { header, status: vec![health.report()] }).await.is_err() {
+                break;
+            }
+        }
+    });
+    Ok(())
+}
+
+/// Keeps account of who listens, and warns of those who would but can't.
+async fn follow_discovery(participant: DomainParticipant, endpoints: Endpoints) {
+    let listener = participant.status_listener();
+    let mut events = listener.as_async_status_stream();
+    while let Some(event) = events.next().await {
+        match event {
+            DomainParticipantStatusEvent::RemoteReaderMatched { local_writer, remote_reader } => {
+                endpoints.matched(local_writer, remote_reader);
+            }
+            DomainParticipantStatusEvent::ReaderLost { guid, .. } => endpoints.lost(guid),
+            DomainParticipantStatusEvent::RemoteReaderQosIncompatible {
+                local_writer: local,
+                requested_qos,
+                offered_qos,
+                ..
+            } => warn_of_incompatible(&endpoints, local, "subscription", &requested_qos, &offered_qos),
+            DomainParticipantStatusEvent::RemoteWriterQosIncompatible {
+                local_reader: local,
+                requested_qos,
+                offered_qos,
+                ..
+            } => warn_of_incompatible(&endpoints, local, "publisher", &requested_qos, &offered_qos),
+            _ => {}
+        }
+    }
+}
+
+fn warn_of_incompatible(
+    endpoints: &Endpoints,
+    local: rustdds::GUID,
+    remote: &str,
+    requested: &rustdds::QosPolicies,
+    offered: &rustdds::QosPolicies,
+) {
+    if let Some(name) = endpoints.name(local) {
+        log::warn!(
+            "a {remote} on {name} does not match: requested {:?}, {:?}; offered {:?}, {:?}",
+            requested.reliability(),
+            requested.durability(),
+            offered.reliability(),
+            offered.durability()
+        );
+    }
+}
+
+/// Resolves when a thread of the middleware has ended.
+async fn watchdog() -> ProcessError {
+    let mut known = middleware_threads();
+    loop {
+        smol::Timer::after(WATCH_PERIOD).await;
+        let alive = middleware_threads();
+        if let Some((_, name)) = known.iter().find(|thread| !alive.contains(thread)) {
+            return ProcessError::Deaf(name.clone());
+        }
+        known = alive;
+    }
+}
+
+/// Number and name of the threads of the middleware in this process; empty where the system doesn't tell.
+fn middleware_threads() -> Vec<(String, String)> {
+    let Ok(tasks) = std::fs::read_dir("/proc/self/task") else { return Vec::new() };
+    tasks
+        .flatten()
+        .filter_map(|task| {
+            let name = std::fs::read_to_string(task.path().join("comm")).ok()?;
+            let number = task.file_name().to_string_lossy().into_owned();
+            name.starts_with(MIDDLEWARE_THREADS).then(|| (number, name.trim_end().to_owned()))
+        })
+        .collect()
+}

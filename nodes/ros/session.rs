@@ -1,0 +1,291 @@
+//! One node: its topics as streams and sinks, its services as streams of calls.
+//!
+//! Streams and sinks are bounded channels, the same that join the nodes of a composed cell: a small task beside the
+//! node's loop moves the messages between channel and middleware.
+
+use std::cell::RefCell;
+use std::collections::{HashMap, HashSet};
+use std::rc::Rc;
+use std::sync::{Arc, Mutex, PoisonError};
+
+use futures::channel::{mpsc, oneshot};
+use futures::{SinkExt, StreamExt};
+use jigsaw_msgs::builtin_interfaces::msg::Time;
+use jigsaw_msgs::{Message, Service};
+use ros2_client::{Context, MessageTypeName, Name, Node, ServiceMapping, ServiceTypeName};
+use rustdds::GUID;
+use serde::{Deserialize, Serialize};
+
+use super::args::{ArgsError, NodeNames};
+use super::health::Health;
+use super::params::Parameters;
+use super::topics::{SERVICE_QOS, Topic};
+
+/// Messages that may wait between the middleware and a node's loop. Few: what waits further out waits in the
+/// middleware's cache, whose depth is the topic's.
+pub const CHANNEL_DEPTH: usize = 4;
+
+/// Why a node could not be opened.
+#[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
+pub enum SessionError {
+    /// A name that ROS does not allow.
+    #[error(transparent)]
+    Name(#[from] ArgsError),
+    /// The middleware refused something.
+    #[error("{what}: {reason}")]
+    Middleware {
+        /// What was to be opened.
+        what: String,
+        /// The middleware's words.
+        reason: String,
+    },
+}
+
+impl SessionError {
+    pub(super) fn middleware(what: impl Into<String>, reason: impl std::fmt::Display) -> Self {
+        Self::Middleware { what: what.into(), reason: reason.to_string() }
+    }
+}
+
+/// A request to a service, with the way back.
+#[derive(Debug)]
+pub struct Call<S: Service> {
+    /// What the caller wants.
+    pub request: S::Request,
+    /// Where the answer goes; a call that is dropped is never answered.
+    pub reply: oneshot::Sender<S::Response>,
+}
+
+/// Gives a message of a service the client library's marker trait; same bytes.
+#[derive(Debug, Clone, Serialize, Deserialize)]
+#[serde(transparent, bound = "")]
+struct Wire<T: Message>(T);
+
+impl<T: Message> ros2_client::Message for Wire<T> {}
+
+/// What discovery has told of the endpoints of this process.
+#[derive(Debug, Clone, Default)]
+pub(super) struct Endpoints(Arc<Mutex<EndpointTable>>);
+
+#[derive(Debug, Default)]
+struct EndpointTable {
+    names: HashMap<GUID, String>,
+    readers_of: HashMap<GUID, HashSet<GUID>>,
+}
+
+impl Endpoints {
+    fn with<R>(&self, action: impl FnOnce(&mut EndpointTable) -> R) -> R {
+        action(&mut self.0.lock().unwrap_or_else(PoisonError::into_inner))
+    }
+
+    fn opened(&self, endpoint: GUID, name: &str) {
+        self.with(|table| table.names.insert(endpoint, name.to_owned()));
+    }
+
+    pub(super) fn matched(&self, writer: GUID, reader: GUID) {
+        self.with(|table| table.readers_of.entry(writer).or_default().insert(reader));
+    }
+
+    pub(super) fn lost(&self, reader: GUID) {
+        self.with(|table| {
+            table.readers_of.values_mut().for_each(|readers| {
+                readers.remove(&reader);
+            });
+        });
+    }
+
+    /// The name of the topic of an endpoint of this process.
+    pub(super) fn name(&self, endpoint: GUID) -> Option<String> {
+        self.with(|table| table.names.get(&endpoint).cloned())
+    }
+}
+
+/// Tells whether anyone listens to a topic.
+#[derive(Debug, Clone)]
+pub struct Audience {
+    endpoints: Endpoints,
+    writer: GUID,
+}
+
+impl Audience {
+    /// How many subscriptions there are.
+    pub fn count(&self) -> usize {
+        self.endpoints.with(|table| table.readers_of.get(&self.writer).map_or(0, HashSet::len))
+    }
+}
+
+/// What time it is: that of the system, or the last of `/clock` under `use_sim_time`.
+#[derive(Debug, Clone, Default)]
+pub struct Clock {
+    simulated: Rc<RefCell<Option<Time>>>,
+}
+
+impl Clock {
+    /// The time now. Zero under `use_sim_time` until `/clock` was heard, as in ROS.
+    pub fn now(&self) -> Time {
+        const NANOS: i64 = 1_000_000_000;
+        if let Some(time) = self.simulated.borrow().as_ref() {
+            return time.clone();
+        }
+        let nanos = ros2_client::builtin_interfaces::Time::now().to_nanos();
+        Time {
+            sec: i32::try_from(nanos.div_euclid(NANOS)).unwrap_or(i32::MAX),
+            nanosec: u32::try_from(nanos.rem_euclid(NANOS)).unwrap_or_default(),
+        }
+    }
+
+    pub(super) fn set(&self, time: Option<Time>) {
+        *self.simulated.borrow_mut() = time;
+    }
+
+    /// Goes over to simulated time, unless it has it already.
+    pub(super) fn begin_simulation(&self) {
+        self.simulated.borrow_mut().get_or_insert_default();
+    }
+}
+
+/// An open node.
+pub struct Session {
+    pub(super) context: Context,
+    pub(super) node: Node,
+    pub(super) names: NodeNames,
+    pub(super) executor: Rc<smol::LocalExecutor<'static>>,
+    pub(super) endpoints: Endpoints,
+    /// The parameters, served while the process lives.
+    pub parameters: Arc<Parameters>,
+    /// The counters, published while the process lives.
+    pub health: Arc<Health>,
+    /// The time.
+    pub clock: Clock,
+}
+
+impl Session {
+    /// The names of the node.
+    pub fn names(&self) -> &NodeNames {
+        &self.names
+    }
+
+    /// Runs something beside the node's loop for as long as the process lives.
+    pub fn spawn(&self, future: impl Future<Output = ()> + 'static) {
+        self.executor.spawn(future).detach();
+    }
+
+    /// The messages of a topic. One that can't be decoded is refused and left out.
+    ///
+    /// # Errors
+    /// [`SessionError`] for a bad name, or where the middleware refuses.
+    pub fn subscribe<M: Message>(&mut self, topic: &Topic<M>) -> Result<mpsc::Receiver<M>, SessionError> {
+        let (name, dds_topic) = self.dds_topic(topic)?;
+        let subscription = self
+            .node
+            .create_subscription::<M>(&dds_topic, None)
+            .map_err(|e| SessionError::middleware(format!("subscription of {name}"), e))?;
+        self.endpoints.opened(subscription.guid(), &name);
+        let (mut sender, receiver) = mpsc::channel(CHANNEL_DEPTH);
+        let health = Arc::clone(&self.health);
+        self.spawn(async move {
+            let mut messages = Box::pin(subscription.async_stream());
+            while let Some(message) = messages.next().await {
+                match message {
+                    Ok((message, _)) => {
+                        if sender.send(message).await.is_err() {
+                            break;
+                        }
+                    }
+                    Err(e) => health.refuse("undecodable", &format!("message on {name} can't be decoded: {e}")),
+                }
+            }
+        });
+        Ok(receiver)
+    }
+
+    /// A sink to a topic, and who listens. A message that no reader takes in time is reported and dropped.
+    ///
+    /// # Errors
+    /// As for [`Self::subscribe`].
+    pub fn publish<M: Message>(&mut self, topic: &Topic<M>) -> Result<(mpsc::Sender<M>, Audience), SessionError> {
+        let (name, dds_topic) = self.dds_topic(topic)?;
+        let publisher = self
+            .node
+            .create_publisher::<M>(&dds_topic, None)
+            .map_err(|e| SessionError::middleware(format!("publisher of {name}"), e))?;
+        let writer = publisher.guid();
+        self.endpoints.opened(writer, &name);
+        let (sender, mut receiver) = mpsc::channel(CHANNEL_DEPTH);
+        let health = Arc::clone(&self.health);
+        self.spawn(async move {
+            while let Some(message) = receiver.next().await {
+                if publisher.async_publish(message).await.is_err() {
+                    health
+                        .warn("write", &format!("a message on {name} was not written: its readers are too far behind"));
+                }
+            }
+        });
+        Ok((sender, Audience { endpoints: self.endpoints.clone(), writer }))
+    }
+
+    /// The calls of a service.
+    ///
+    /// # Errors
+    /// As for [`Self::subscribe`].
+    pub fn serve<S: Service + 'static>(&mut self, service: &str) -> Result<mpsc::Receiver<Call<S>>, SessionError> {
+        let name = self.names.service(service)?;
+        let server = self
+            .node
+            .create_server::<Wire<S::Request>, Wire<S::Response>>(
+                ServiceMapping::Enhanced,
+                &dds_name(&name)?,
+                &ServiceTypeName::new(S::PACKAGE, S::NAME),
+                SERVICE_QOS,
+                SERVICE_QOS,
+            )
+            .map_err(|e| SessionError::middleware(format!("service {name}"), e))?;
+        let server = Rc::new(server);
+        let (mut sender, receiver) = mpsc::channel(CHANNEL_DEPTH);
+        let health = Arc::clone(&self.health);
+        let executor = Rc::clone(&self.executor);
+        self.spawn(async move {
+            let mut requests = server.receive_request_stream();
+            while let Some(request) = requests.next().await {
+                let (id, request) = match request {
+                    Ok((id, Wire(request))) => (id, request),
+                    Err(e) => {
+                        health.refuse("undecodable", &format!("request of {name} can't be decoded: {e}"));
+                        continue;
+                    }
+                };
+                let (reply, answer) = oneshot::channel();
+                if sender.send(Call { request, reply }).await.is_err() {
+                    break;
+                }
+                let (server, health, name) = (Rc::clone(&server), Arc::clone(&health), name.clone());
+                executor
+                    .spawn(async move {
+                        if let Ok(answer) = answer.await
+                            && let Err(e) = server.async_send_response(id, Wire(answer)).await
+                        {
+                            health.warn("write", &format!("the answer of {name} was not written: {e}"));
+                        }
+                    })
+                    .detach();
+            }
+        });
+        Ok(receiver)
+    }
+
+    fn dds_topic<M: Message>(&self, topic: &Topic<M>) -> Result<(String, rustdds::Topic), SessionError> {
+        let name = self.names.topic(topic.name)?;
+        let type_name = MessageTypeName::new(M::TYPE.package, M::TYPE.name);
+        let dds_topic = self
+            .node
+            .create_topic(&dds_name(&name)?, type_name, &topic.qos)
+            .map_err(|e| SessionError::middleware(format!("topic {name}"), e))?;
+        Ok((name, dds_topic))
+    }
+}
+
+/// An absolute name in the client library's form.
+pub(super) fn dds_name(name: &str) -> Result<Name, SessionError> {
+    Name::parse(name).map_err(|e| SessionError::middleware(format!("name {name}"), e))
+}

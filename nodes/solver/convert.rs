@@ -1,0 +1,465 @@
+//! Messages of features to pieces, assemblies to messages: pixels to metres on the way.
+
+use std::collections::HashSet;
+use std::hash::{DefaultHasher, Hash, Hasher};
+
+use isthmus::contour::Border;
+use isthmus::isthmus::{Isthmus, Polarity};
+use isthmus::{Features, Point};
+use jigsaw::{Assembly, Piece};
+use jigsaw_msgs::builtin_interfaces::msg::Time;
+use jigsaw_msgs::geometry_msgs::msg::{Point as PointMessage, Pose, Transform, TransformStamped, Vector3};
+use jigsaw_msgs::msg::{
+    Assembly as AssemblyMessage, CandidateCounts, Isthmus as IsthmusMessage, Mating, PieceFeatures, PiecePose,
+};
+use jigsaw_msgs::std_msgs::msg::{ColorRGBA, Header};
+use jigsaw_msgs::tf2_msgs::msg::TFMessage;
+use jigsaw_msgs::visualization_msgs::msg::{Marker, MarkerArray};
+use nalgebra::{Isometry2, Point2};
+
+use crate::capture::convert::MAX_SIDE_PX;
+use crate::feature::convert::{MAX_ID_LENGTH, is_piece_id};
+use crate::ros::transforms::{PixelPlane, pose_message};
+
+/// Most points of a border: a piece as large as the largest frame, sampled at every pixel of its circumference.
+const MAX_BORDER_POINTS: usize = 4 * MAX_SIDE_PX as usize;
+
+/// Most isthmuses of a piece. Real pieces have about ten.
+const MAX_ISTHMUSES: usize = 1000;
+
+/// Share by which the length of the border in the message may differ from that of its points.
+const LENGTH_TOLERANCE: f64 = 0.05;
+
+/// Share by which the scales of two pieces may differ.
+const SCALE_TOLERANCE: f64 = 1e-6;
+
+/// Why a `PieceFeatures` is refused: which field, and which rule it breaks.
+#[derive(Debug, Clone, PartialEq, thiserror::Error)]
+#[non_exhaustive]
+pub enum FeaturesError {
+    /// A name that can't name a coordinate frame.
+    #[error("id '{0}': must be 1 to {MAX_ID_LENGTH} characters without '/' or blanks")]
+    Id(String),
+    /// A name that another piece has.
+    #[error("piece '{0}': another piece of this id, with another border, is here already; reset before it is reused")]
+    DuplicateId(String),
+    /// A field out of range, or one that does not fit another.
+    #[error("piece '{id}': {field} is {value}: must be {rule}")]
+    Field {
+        /// Piece.
+        id: String,
+        /// Field.
+        field: &'static str,
+        /// Its value.
+        value: String,
+        /// What it must be.
+        rule: String,
+    },
+    /// As many pieces as are allowed.
+    #[error("piece '{id}': {most} pieces are here already, as many as parameter 'maximum_pieces' allows")]
+    Full {
+        /// Piece.
+        id: String,
+        /// The parameter.
+        most: usize,
+    },
+    /// The solver does not take it.
+    #[error("piece refused by the solver: {0}")]
+    Solver(String),
+}
+
+impl FeaturesError {
+    /// The kind, for counting and throttling.
+    pub fn kind(&self) -> &'static str {
+        match self {
+            Self::Id(_) => "id",
+            Self::DuplicateId(_) => "duplicate_id",
+            Self::Field { field, .. } => field,
+            Self::Full { .. } => "maximum_pieces",
+            Self::Solver(_) => "solver",
+        }
+    }
+}
+
+/// Where a piece was seen.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Sighting {
+    /// File or topic.
+    pub source: String,
+    /// When.
+    pub stamp: Time,
+    /// The table under the frame it was seen in.
+    pub table: PixelPlane,
+    /// Its area centroid in the frame, the origin of the piece's own coordinate frame.
+    pub centroid_in_image: Point,
+    /// Its border in the frame.
+    pub border_in_image: Vec<Point>,
+}
+
+/// The piece and the sighting that a message carries.
+///
+/// # Errors
+/// The first field that is out of range or does not fit the others.
+pub fn piece(message: &PieceFeatures) -> Result<(Piece, Sighting), FeaturesError> {
+    let id = &message.id;
+    if !is_piece_id(id) {
+        return Err(FeaturesError::Id(id.chars().take(MAX_ID_LENGTH).collect()));
+    }
+    let check = |field: &'static str, holds: bool, value: &dyn ToString, rule: &dyn ToString| {
+        if holds {
+            return Ok(());
+        }
+        Err(FeaturesError::Field { id: id.clone(), field, value: value.to_string(), rule: rule.to_string() })
+    };
+    let sides = 1..=MAX_SIDE_PX;
+    check("frame_width_px", sides.contains(&message.frame_width_px), &message.frame_width_px, &"1 to 32768")?;
+    check("frame_height_px", sides.contains(&message.frame_height_px), &message.frame_height_px, &"1 to 32768")?;
+    let scale = message.metres_per_pixel;
+    check("metres_per_pixel", scale.is_finite() && scale > 0.0, &scale, &"a positive number")?;
+    check("noise_px", (0.0..=1e3).contains(&message.noise_px), &message.noise_px, &"0 to 1000")?;
+    let (xs, ys) = (&message.border_x_px, &message.border_y_px);
+    check("border_y_px length", xs.len() == ys.len(), &ys.len(), &format!("that of border_x_px, {}", xs.len()))?;
+    let enough = jigsaw::Solver::MIN_BORDER_POINTS..=MAX_BORDER_POINTS;
+    let rule = format!("{} to {}", enough.start(), enough.end());
+    check("border_x_px length", enough.contains(&xs.len()), &xs.len(), &rule)?;
+    let near = |v: &f32| v.abs() <= 2.0 * MAX_SIDE_PX as f32;
+    let bad = xs.iter().chain(ys).find(|v| !near(v)).copied().unwrap_or_default();
+    check("border_x_px, border_y_px", near(&bad) && xs.iter().chain(ys).all(near), &bad, &"-65536 to 65536")?;
+
+    let points: Vec<Point> = xs.iter().zip(ys).map(|(&x, &y)| Point2::new(x.into(), y.into())).collect();
+    let next = |i: usize| points[(i + 1) % points.len()];
+    let length: f64 = (0..points.len()).map(|i| (next(i) - points[i]).norm()).sum();
+    let (twice_area, moment) = (0..points.len()).fold((0.0, Point::origin().coords), |(area, moment), i| {
+        let (p, q) = (points[i], next(i));
+        let cross = p.x * q.y - q.x * p.y;
+        (area + cross, moment + (p.coords + q.coords) * cross)
+    });
+    check("area of the border", twice_area > 1.0, &(twice_area / 2.0), &"positive: clockwise as seen in the image")?;
+    let told = f64::from(message.border_length_px);
+    let agrees = (told - length).abs() <= LENGTH_TOLERANCE * length;
+    check("border_length_px", agrees, &told, &format!("{length:.1}, the length of the border"))?;
+    check("isthmuses length", message.isthmuses.len() <= MAX_ISTHMUSES, &message.isthmuses.len(), &MAX_ISTHMUSES)?;
+    for isthmus in &message.isthmuses {
+        check_isthmus(isthmus, told, &check)?;
+    }
+
+    let centroid_in_image = Point::from(moment / (3.0 * twice_area));
+    let spacing = length / points.len() as f64;
+    let features = Features {
+        border: Border { points: points.clone(), spacing },
+        noise: message.noise_px.into(),
+        isthmuses: message.isthmuses.iter().map(isthmus).collect(),
+        // Matching needs no skeleton.
+        endoskeleton: Default::default(),
+        exoskeleton: Default::default(),
+    };
+    let sighting = Sighting {
+        source: message.source.clone(),
+        stamp: message.header.stamp.clone(),
+        table: PixelPlane::table(message.frame_width_px, message.frame_height_px, scale),
+        centroid_in_image,
+        border_in_image: points,
+    };
+    Ok((Piece { id: id.clone(), features }, sighting))
+}
+
+type Check<'a> = dyn Fn(&'static str, bool, &dyn ToString, &dyn ToString) -> Result<(), FeaturesError> + 'a;
+
+fn check_isthmus(isthmus: &IsthmusMessage, border_length: f64, check: &Check<'_>) -> Result<(), FeaturesError> {
+    let known = [IsthmusMessage::POSITIVE, IsthmusMessage::NEGATIVE].contains(&isthmus.polarity);
+    check("isthmuses.polarity", known, &isthmus.polarity, &"0 (positive) or 1 (negative)")?;
+    let reach = 2.0 * MAX_SIDE_PX as f32;
+    for point in isthmus.critical_points_px.iter().chain([&isthmus.point_px]) {
+        let near = point.x.abs() <= reach && point.y.abs() <= reach;
+        check(
+            "isthmuses.critical_points_px, point_px",
+            near,
+            &format!("({}, {})", point.x, point.y),
+            &"-65536 to 65536",
+        )?;
+    }
+    for arc in isthmus.arc_px {
+        let on_border = (0.0..=border_length * (1.0 + LENGTH_TOLERANCE)).contains(&f64::from(arc));
+        check("isthmuses.arc_px", on_border, &arc, &format!("0 to the border's length, {border_length:.1}"))?;
+    }
+    check("isthmuses.width_px", isthmus.width_px > 0.0 && isthmus.width_px <= reach, &isthmus.width_px, &"positive")?;
+    let path = f64::from(isthmus.path_length_px);
+    let on_border = path > 0.0 && path <= border_length * (1.0 + LENGTH_TOLERANCE);
+    check("isthmuses.path_length_px", on_border, &path, &format!("up to the border's length, {border_length:.1}"))?;
+    let persistence = isthmus.persistence_px;
+    // Infinite where no end of the branch is narrower.
+    check("isthmuses.persistence_px", persistence >= 0.0, &persistence, &"0 or more")
+}
+
+fn isthmus(message: &IsthmusMessage) -> Isthmus {
+    let point = |p: &jigsaw_msgs::geometry_msgs::msg::Point32| Point2::new(p.x.into(), p.y.into());
+    let [first, second] = &message.critical_points_px;
+    Isthmus {
+        polarity: if message.polarity == IsthmusMessage::POSITIVE { Polarity::Positive } else { Polarity::Negative },
+        point: point(&message.point_px),
+        critical_points: [point(first), point(second)],
+        arc: message.arc_px.map(f64::from),
+        width: message.width_px.into(),
+        path_length: message.path_length_px.into(),
+        persistence: message.persistence_px.into(),
+        salient: message.salient,
+    }
+}
+
+/// A hash of what makes a piece: the same message sent again has the same.
+pub fn fingerprint(message: &PieceFeatures) -> u64 {
+    let mut hasher = DefaultHasher::new();
+    message.source.hash(&mut hasher);
+    for v in message.border_x_px.iter().chain(&message.border_y_px) {
+        v.to_bits().hash(&mut hasher);
+    }
+    hasher.finish()
+}
+
+/// Checks that a piece has the scale of the others: the solver compares pixels.
+///
+/// # Errors
+/// A scale that differs.
+pub fn check_scale(id: &str, scale: f64, others: Option<f64>) -> Result<(), FeaturesError> {
+    match others {
+        Some(known) if (scale / known - 1.0).abs() > SCALE_TOLERANCE => Err(FeaturesError::Field {
+            id: id.to_owned(),
+            field: "metres_per_pixel",
+            value: scale.to_string(),
+            rule: format!("{known}, as that of the other pieces"),
+        }),
+        _ => Ok(()),
+    }
+}
+
+/// Names of the frames, and what counts as complete.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Naming {
+    /// Parent of the observed frames.
+    pub table_frame: String,
+    /// Parent of the goal frames.
+    pub puzzle_frame: String,
+    /// Pieces of the whole puzzle, 0 if not known.
+    pub expected_pieces: usize,
+}
+
+/// What the solver has found, with all that is needed to say it in messages.
+#[derive(Debug, Clone)]
+pub struct Solution {
+    /// The pieces, in the order of the assembly's indices.
+    pub pieces: Vec<Piece>,
+    /// Their sightings, in the same order.
+    pub sightings: Vec<Sighting>,
+    /// The assembly.
+    pub assembly: Assembly,
+    /// Names of the frames.
+    pub naming: Naming,
+}
+
+impl Solution {
+    /// The puzzle in metres: origin at the bottom left corner of the assembly.
+    pub fn puzzle_plane(&self) -> PixelPlane {
+        let corner = self
+            .assembly
+            .placements
+            .iter()
+            .filter_map(|placement| Some((placement, self.sightings.get(placement.piece)?)))
+            .flat_map(|(placement, sighting)| sighting.border_in_image.iter().map(|p| placement.puzzle_from_image * p))
+            .reduce(|corner, p| Point2::new(corner.x.min(p.x), corner.y.max(p.y)))
+            .unwrap_or_else(Point2::origin);
+        let metres_per_pixel = self.sightings.first().map_or(1.0, |s| s.table.metres_per_pixel);
+        PixelPlane { metres_per_pixel, origin_px: corner }
+    }
+
+    /// How far the puzzle is.
+    pub fn state(&self) -> u8 {
+        let placed = self.assembly.placements.len();
+        if placed == 0 || self.assembly.matings.is_empty() && self.pieces.len() != 1 {
+            return AssemblyMessage::COLLECTING;
+        }
+        let one_assembly =
+            self.assembly.unplaced.is_empty() && self.assembly.placements.iter().all(|p| p.component == 0);
+        let whole = match self.naming.expected_pieces {
+            0 => self.pieces.len() > 1 && !self.has_open_mouth(),
+            expected => placed >= expected,
+        };
+        if one_assembly && whole { AssemblyMessage::COMPLETE } else { AssemblyMessage::PARTIAL }
+    }
+
+    /// Whether a piece has a mouth that no tab is in: then another piece is still to come. (Necks don't tell: a body
+    /// has waists that look like necks.)
+    fn has_open_mouth(&self) -> bool {
+        let mated: HashSet<(usize, usize)> =
+            self.assembly.matings.iter().map(|m| (m.negative_piece, m.negative_isthmus)).collect();
+        self.pieces.iter().enumerate().any(|(p, piece)| {
+            piece.features.isthmuses.iter().enumerate().any(|(i, isthmus)| {
+                isthmus.polarity == Polarity::Negative && isthmus.salient && !mated.contains(&(p, i))
+            })
+        })
+    }
+
+    fn id(&self, piece: usize) -> String {
+        self.pieces.get(piece).map(|p| p.id.clone()).unwrap_or_default()
+    }
+
+    fn stamp(&self) -> Time {
+        let newest = self.sightings.iter().map(|s| (s.stamp.sec, s.stamp.nanosec)).max().unwrap_or_default();
+        Time { sec: newest.0, nanosec: newest.1 }
+    }
+
+    fn header(&self) -> Header {
+        Header { stamp: self.stamp(), frame_id: self.naming.puzzle_frame.clone() }
+    }
+
+    fn observed(sighting: &Sighting) -> Pose {
+        pose_message(&sighting.table.pose(&Isometry2::identity(), sighting.centroid_in_image))
+    }
+
+    /// The message on `assembly`.
+    pub fn assembly_message(&self) -> AssemblyMessage {
+        let plane = self.puzzle_plane();
+        let pieces = self
+            .assembly
+            .placements
+            .iter()
+            .filter_map(|placement| {
+                let sighting = self.sightings.get(placement.piece)?;
+                Some(PiecePose {
+                    id: self.id(placement.piece),
+                    source: sighting.source.clone(),
+                    observed: Self::observed(sighting),
+                    goal: pose_message(&plane.pose(&placement.puzzle_from_image, sighting.centroid_in_image)),
+                    component: u32::try_from(placement.component).unwrap_or(u32::MAX),
+                    confidence: placement.confidence as f32,
+                })
+            })
+            .collect();
+        let matings = self.assembly.matings.iter().map(|mating| Mating {
+            positive_piece: self.id(mating.positive_piece),
+            positive_isthmus: count(mating.positive_isthmus),
+            negative_piece: self.id(mating.negative_piece),
+            negative_isthmus: count(mating.negative_isthmus),
+            correlation: mating.correlation as f32,
+            ave_gap: (mating.ave_gap * plane.metres_per_pixel) as f32,
+            clearance: (mating.clearance * plane.metres_per_pixel) as f32,
+            confidence: mating.confidence as f32,
+        });
+        let table = &self.assembly.table;
+        AssemblyMessage {
+            header: self.header(),
+            state: self.state(),
+            table_frame: self.naming.table_frame.clone(),
+            pieces,
+            unplaced: self.assembly.unplaced.iter().map(|&piece| self.id(piece)).collect(),
+            matings: matings.collect(),
+            table: CandidateCounts {
+                positive: count(table.positive),
+                negative: count(table.negative),
+                pairs: count(table.pairs),
+                after_opening: count(table.after_opening),
+                after_length: count(table.after_length),
+                after_correlation: count(table.after_correlation),
+                after_overlap: count(table.after_overlap),
+                backtracks: count(table.backtracks),
+            },
+        }
+    }
+
+    /// The message on `/tf_static`: every transform there is, because a late joiner gets the last message alone.
+    pub fn transforms_message(&self) -> TFMessage {
+        let transform = |parent: &str, child: String, stamp: &Time, pose: Pose| TransformStamped {
+            header: Header { stamp: stamp.clone(), frame_id: parent.to_owned() },
+            child_frame_id: child,
+            transform: Transform {
+                translation: Vector3 { x: pose.position.x, y: pose.position.y, z: pose.position.z },
+                rotation: pose.orientation,
+            },
+        };
+        let plane = self.puzzle_plane();
+        let observed = self.pieces.iter().zip(&self.sightings).map(|(piece, sighting)| {
+            let child = format!("piece_{}", piece.id);
+            transform(&self.naming.table_frame, child, &sighting.stamp, Self::observed(sighting))
+        });
+        let goals = self.assembly.placements.iter().filter_map(|placement| {
+            let sighting = self.sightings.get(placement.piece)?;
+            let goal = pose_message(&plane.pose(&placement.puzzle_from_image, sighting.centroid_in_image));
+            let child = format!("piece_{}_goal", self.id(placement.piece));
+            Some(transform(&self.naming.puzzle_frame, child, &sighting.stamp, goal))
+        });
+        TFMessage { transforms: observed.chain(goals).collect() }
+    }
+
+    /// The message on `assembly/markers`: the outlines of the pieces in place and their names.
+    pub fn markers_message(&self) -> MarkerArray {
+        let plane = self.puzzle_plane();
+        let base = |ns: &str, id: usize, kind: i32| Marker {
+            header: self.header(),
+            ns: ns.to_owned(),
+            id: i32::try_from(id).unwrap_or(i32::MAX),
+            r#type: kind,
+            action: Marker::ADD,
+            pose: identity_pose(),
+            ..Marker::default()
+        };
+        // What was drawn for an earlier assembly goes first.
+        let mut markers = vec![Marker { action: Marker::DELETEALL, ..base("", 0, Marker::LINE_STRIP) }];
+        for placement in &self.assembly.placements {
+            let Some(sighting) = self.sightings.get(placement.piece) else { continue };
+            let outline: Vec<PointMessage> = sighting
+                .border_in_image
+                .iter()
+                .chain(sighting.border_in_image.first())
+                .map(|p| plane.metres_from_pixels(placement.puzzle_from_image * p))
+                .map(|p| PointMessage { x: p.x, y: p.y, z: 0.0 })
+                .collect();
+            let size = extent(&outline);
+            let color = component_color(placement.component);
+            markers.push(Marker {
+                points: outline,
+                scale: Vector3 { x: size * LINE_WIDTH_SHARE, y: 0.0, z: 0.0 },
+                color: color.clone(),
+                ..base("outline", placement.piece, Marker::LINE_STRIP)
+            });
+            let place = plane.metres_from_pixels(placement.puzzle_from_image * sighting.centroid_in_image);
+            let mut name = base("id", placement.piece, Marker::TEXT_VIEW_FACING);
+            name.pose.position = PointMessage { x: place.x, y: place.y, z: 0.0 };
+            name.scale.z = size * TEXT_HEIGHT_SHARE;
+            name.color = color;
+            name.text = self.id(placement.piece);
+            markers.push(name);
+        }
+        MarkerArray { markers }
+    }
+}
+
+/// Width of an outline, as a share of the piece's size.
+const LINE_WIDTH_SHARE: f64 = 0.01;
+
+/// Height of a name, as a share of the piece's size.
+const TEXT_HEIGHT_SHARE: f64 = 0.12;
+
+fn identity_pose() -> Pose {
+    pose_message(&Isometry2::identity())
+}
+
+fn extent(points: &[PointMessage]) -> f64 {
+    let range = |value: fn(&PointMessage) -> f64| {
+        let (low, high) =
+            points.iter().map(value).fold((f64::MAX, f64::MIN), |(low, high), v| (low.min(v), high.max(v)));
+        (high - low).max(0.0)
+    };
+    range(|p| p.x).max(range(|p| p.y))
+}
+
+/// The main assembly in green, the others in orange.
+fn component_color(component: usize) -> ColorRGBA {
+    if component == 0 {
+        ColorRGBA { r: 0.0, g: 0.62, b: 0.45, a: 1.0 }
+    } else {
+        ColorRGBA { r: 0.9, g: 0.62, b: 0.0, a: 1.0 }
+    }
+}
+
+fn count(n: usize) -> u32 {
+    u32::try_from(n).unwrap_or(u32::MAX)
+}

@@ -1,0 +1,319 @@
+//! Solver node: shapes in, the assembly and the poses of the pieces out.
+//!
+//! Pieces are taken in as they come. When none has come for a short while (`settle_time`), the puzzle is solved in a
+//! worker thread; pieces that come meanwhile are taken in after it. Every solution is published, also a partial one.
+
+pub mod convert;
+pub mod params;
+
+use std::collections::HashMap;
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use futures::channel::mpsc;
+use futures::future::{Fuse, FusedFuture};
+use futures::{FutureExt, SinkExt, Stream, StreamExt, pin_mut};
+use jigsaw::{Assembly, Params, Piece, Solver, SolverError};
+use jigsaw_msgs::msg::{Assembly as AssemblyMessage, PieceFeatures};
+use jigsaw_msgs::std_srvs::srv::{Trigger, TriggerResponse};
+use jigsaw_msgs::tf2_msgs::msg::TFMessage;
+use jigsaw_msgs::visualization_msgs::msg::MarkerArray;
+
+use crate::ros::health::Health;
+use crate::ros::params::Parameters;
+use crate::ros::process::{ProcessError, Program, Work};
+use crate::ros::session::{Call, Session};
+use crate::ros::topics;
+use convert::{FeaturesError, Naming, Sighting, Solution};
+
+/// The program of this node.
+pub const PROGRAM: Program = Program {
+    name: "solver_node",
+    about: "Assembles jigsaw puzzles by shape.\n\n\
+            Topic in:   pieces/features (jigsaw_msgs/PieceFeatures)\n\
+            Topics out: assembly (jigsaw_msgs/Assembly), /tf_static, assembly/image (sensor_msgs/Image),\n            \
+            assembly/markers (visualization_msgs/MarkerArray)\n\
+            Services:   reset (std_srvs/Trigger): forget all pieces; solve (std_srvs/Trigger): solve now",
+    parameters: params::PARAMETERS,
+};
+
+/// Where the results go.
+#[derive(Debug, Clone)]
+pub struct Outputs {
+    /// The assembly.
+    pub assembly: mpsc::Sender<AssemblyMessage>,
+    /// The poses.
+    pub transforms: mpsc::Sender<TFMessage>,
+    /// The outlines.
+    pub markers: mpsc::Sender<MarkerArray>,
+}
+
+/// Opens the topics and services of the node and gives its loop, which takes the shapes from `features`.
+///
+/// # Errors
+/// A name that is no name; a refusal of the middleware.
+pub fn open(
+    mut session: Session,
+    features: impl Stream<Item = PieceFeatures> + Unpin + 'static,
+) -> Result<Work, ProcessError> {
+    let resets = session.serve::<Trigger>(topics::RESET_SERVICE)?;
+    let solves = session.serve::<Trigger>(topics::SOLVE_SERVICE)?;
+    let outputs = Outputs {
+        assembly: session.publish(&topics::ASSEMBLY)?.0,
+        transforms: session.publish(&topics::TF_STATIC)?.0,
+        markers: session.publish(&topics::ASSEMBLY_MARKERS)?.0,
+    };
+    let (parameters, health) = (Arc::clone(&session.parameters), Arc::clone(&session.health));
+    Ok(Box::pin(async move {
+        run(features, resets, solves, outputs, parameters, health).await;
+        drop(session);
+        Ok(())
+    }))
+}
+
+/// The node's loop. Ends, after a last solution, when shapes and calls have ended.
+pub async fn run(
+    features: impl Stream<Item = PieceFeatures> + Unpin,
+    resets: impl Stream<Item = Call<Trigger>> + Unpin,
+    solves: impl Stream<Item = Call<Trigger>> + Unpin,
+    outputs: Outputs,
+    parameters: Arc<Parameters>,
+    health: Arc<Health>,
+) {
+    let mut changes = parameters.changes();
+    let mut table = Table::new(outputs, parameters, health);
+    let (mut features, mut resets, mut solves) = (features.fuse(), resets.fuse(), solves.fuse());
+    let solving = Fuse::terminated();
+    pin_mut!(solving);
+    loop {
+        let idle = solving.is_terminated();
+        if idle && features.is_done() && resets.is_done() && solves.is_done() && table.due.is_none() {
+            break;
+        }
+        let wait = table.due.filter(|_| idle).map(|due| due.saturating_duration_since(Instant::now()));
+        if wait.is_some_and(|wait| wait.is_zero()) {
+            solving.set(smol::unblock(table.work()).fuse());
+            continue;
+        }
+        let mut settled = FutureExt::fuse(wait.map_or_else(smol::Timer::never, smol::Timer::after));
+        futures::select! {
+            message = features.next() => if let Some(message) = message {
+                table.take(&message);
+            },
+            _ = settled => {}
+            done = solving => table.publish(done).await,
+            call = resets.next() => if let Some(call) = call {
+                table.reset();
+                table.publish_empty().await;
+                answer(call, true, "all pieces are forgotten".to_owned());
+            },
+            call = solves.next() => if let Some(call) = call {
+                table.waiting.push(call);
+                table.due = Some(Instant::now());
+            },
+            change = changes.next() => if change.is_some() && !table.sightings.is_empty() {
+                table.due = Some(Instant::now());
+            },
+        }
+    }
+}
+
+fn answer(call: Call<Trigger>, success: bool, message: String) {
+    // The caller may have gone; that is no concern of the node.
+    let _ = call.reply.send(TriggerResponse { success, message });
+}
+
+/// What one run of the worker gives back.
+struct Done {
+    solver: Option<Solver>,
+    assembly: Assembly,
+    /// Pieces the solver did not take, with its reasons.
+    refused: Vec<(String, String)>,
+    generation: u64,
+    seconds: f64,
+}
+
+/// A solver with these parameters, and the pieces that it must be given again where they have changed.
+fn with_params(solver: Option<Solver>, params: Params) -> Result<(Solver, Vec<Piece>), SolverError> {
+    match solver {
+        Some(solver) if *solver.params() == params => Ok((solver, Vec::new())),
+        other => {
+            let kept = other.map(|solver| solver.pieces().to_vec()).unwrap_or_default();
+            Ok((Solver::new(params)?, kept))
+        }
+    }
+}
+
+/// The pieces on the table, and the state of the solution.
+struct Table {
+    outputs: Outputs,
+    parameters: Arc<Parameters>,
+    health: Arc<Health>,
+    /// None at first, after a reset, and while the worker has it.
+    solver: Option<Solver>,
+    /// Pieces that the solver does not have yet.
+    incoming: Vec<Piece>,
+    /// All pieces by name, with a fingerprint of the message they came in.
+    sightings: HashMap<String, (u64, Sighting)>,
+    /// When to solve next, if there is a reason to.
+    due: Option<Instant>,
+    /// Callers that wait for the next solution.
+    waiting: Vec<Call<Trigger>>,
+    /// Counts resets: what a worker began before one is of no use after it.
+    generation: u64,
+    /// The transforms published last.
+    transforms: TFMessage,
+}
+
+impl Table {
+    fn new(outputs: Outputs, parameters: Arc<Parameters>, health: Arc<Health>) -> Self {
+        Self {
+            outputs,
+            parameters,
+            health,
+            solver: None,
+            incoming: Vec::new(),
+            sightings: HashMap::new(),
+            due: None,
+            waiting: Vec::new(),
+            generation: 0,
+            transforms: TFMessage::default(),
+        }
+    }
+
+    /// Takes a piece in, or refuses it.
+    fn take(&mut self, message: &PieceFeatures) {
+        match self.admit(message) {
+            Ok(true) => {
+                self.health.received();
+                self.health.figure("pieces", self.sightings.len());
+                let settle_time = Duration::from_secs_f64(self.parameters.double(&params::SETTLE_TIME));
+                self.due = Some(Instant::now() + settle_time);
+            }
+            Ok(false) => log::debug!("piece {} came again", message.id),
+            Err(refusal) => self.health.refuse(refusal.kind(), &refusal.to_string()),
+        }
+    }
+
+    /// Whether the piece is new; the same message again (of a latched topic, or a node that was restarted) is not.
+    fn admit(&mut self, message: &PieceFeatures) -> Result<bool, FeaturesError> {
+        let (piece, sighting) = convert::piece(message)?;
+        let scale = self.sightings.values().next().map(|(_, other)| other.table.metres_per_pixel);
+        convert::check_scale(&piece.id, sighting.table.metres_per_pixel, scale)?;
+        let fingerprint = convert::fingerprint(message);
+        if let Some((known, _)) = self.sightings.get(&piece.id) {
+            return if *known == fingerprint { Ok(false) } else { Err(FeaturesError::DuplicateId(piece.id)) };
+        }
+        let most = params::count(&self.parameters, &params::MAXIMUM_PIECES);
+        if self.sightings.len() >= most {
+            return Err(FeaturesError::Full { id: piece.id, most });
+        }
+        self.sightings.insert(piece.id.clone(), (fingerprint, sighting));
+        self.incoming.push(piece);
+        Ok(true)
+    }
+
+    /// The next run of the worker: takes in what has come, and solves.
+    fn work(&mut self) -> impl FnOnce() -> Done + Send + 'static {
+        self.due = None;
+        self.health.state("solving");
+        let params = params::solver_params(&self.parameters);
+        let solver = self.solver.take();
+        let incoming = std::mem::take(&mut self.incoming);
+        let generation = self.generation;
+        move || {
+            let start = Instant::now();
+            let mut refused = Vec::new();
+            let mut solved = None;
+            match with_params(solver, params) {
+                Ok((mut solver, kept)) => {
+                    for piece in kept.into_iter().chain(incoming) {
+                        let id = piece.id.clone();
+                        if let Err(e) = solver.insert(piece) {
+                            refused.push((id, e.to_string()));
+                        }
+                    }
+                    let assembly = solver.solve();
+                    solved = Some((solver, assembly));
+                }
+                Err(e) => refused.extend(incoming.into_iter().map(|piece| (piece.id, e.to_string()))),
+            }
+            let (solver, assembly) = solved.unzip();
+            let assembly = assembly.unwrap_or_default();
+            Done { solver, assembly, refused, generation, seconds: start.elapsed().as_secs_f64() }
+        }
+    }
+
+    /// Takes the worker's results over and publishes them.
+    async fn publish(&mut self, done: Done) {
+        if done.generation != self.generation {
+            return;
+        }
+        for (id, reason) in done.refused {
+            self.sightings.remove(&id);
+            let refusal = FeaturesError::Solver(reason);
+            self.health.refuse(refusal.kind(), &refusal.to_string());
+        }
+        let pieces = done.solver.as_ref().map(|solver| solver.pieces().to_vec()).unwrap_or_default();
+        let sightings = pieces.iter().filter_map(|p| self.sightings.get(&p.id).map(|(_, s)| s.clone())).collect();
+        self.solver = done.solver;
+        self.health.figure("solve_seconds", format!("{:.4}", done.seconds));
+        self.send(Solution { pieces, sightings, assembly: done.assembly, naming: self.naming() }).await;
+    }
+
+    async fn publish_empty(&mut self) {
+        let solution = Solution {
+            pieces: Vec::new(),
+            sightings: Vec::new(),
+            assembly: Assembly::default(),
+            naming: self.naming(),
+        };
+        self.send(solution).await;
+    }
+
+    fn naming(&self) -> Naming {
+        Naming {
+            table_frame: self.parameters.text(&params::TABLE_FRAME),
+            puzzle_frame: self.parameters.text(&params::PUZZLE_FRAME),
+            expected_pieces: params::count(&self.parameters, &params::EXPECTED_PIECES),
+        }
+    }
+
+    async fn send(&mut self, solution: Solution) {
+        let message = solution.assembly_message();
+        let (placed, seen) = (message.pieces.len(), solution.pieces.len());
+        let state = match message.state {
+            AssemblyMessage::COMPLETE => "complete",
+            AssemblyMessage::PARTIAL => "partial",
+            _ => "collecting",
+        };
+        let summary = format!("{state}: {placed} of {seen} pieces placed, {} matings", message.matings.len());
+        log::info!("{summary}");
+        self.health.state(&summary);
+        self.health.figure("placed", placed);
+        self.health.figure("matings", message.matings.len());
+        self.health.published();
+        // Poses before the assembly: who acts on the assembly finds the transforms there.
+        let transforms = solution.transforms_message();
+        if transforms != self.transforms {
+            self.transforms = transforms.clone();
+            let _ = self.outputs.transforms.send(transforms).await;
+        }
+        // A closed output is that of a process that ends.
+        let _ = self.outputs.assembly.send(message).await;
+        let _ = self.outputs.markers.send(solution.markers_message()).await;
+        for call in self.waiting.drain(..) {
+            answer(call, true, summary.clone());
+        }
+    }
+
+    fn reset(&mut self) {
+        self.generation += 1;
+        self.incoming.clear();
+        self.sightings.clear();
+        self.due = None;
+        self.transforms = TFMessage::default();
+        self.solver = None;
+        self.health.figure("pieces", 0);
+    }
+}
