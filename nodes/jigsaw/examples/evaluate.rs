@@ -6,7 +6,7 @@
 
 use anyhow::{Context, bail};
 use jigsaw::generate::{Cut, Options, Puzzle, Rim};
-use jigsaw::{Params, Piece, Solver};
+use jigsaw::{Params, Piece, Policy, Solver};
 use rayon::prelude::*;
 use std::time::Instant;
 
@@ -111,6 +111,7 @@ fn main() -> anyhow::Result<()> {
                 Some("merge_islands") => params.merge_islands = false,
                 other => bail!("unknown switch {other:?}"),
             },
+            "--paper" => params.policy = Policy::Paper,
             name => names.push(name.to_owned()),
         }
     }
@@ -160,6 +161,9 @@ fn main() -> anyhow::Result<()> {
                 if s.is_perfect() { "" } else { "<<< " },
                 features,
             );
+            if params.policy == Policy::Paper {
+                println!("{:?}", assembly.table);
+            }
         }
     }
     Ok(())

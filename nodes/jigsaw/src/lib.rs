@@ -11,6 +11,7 @@ mod frame;
 mod index;
 mod loops;
 mod outline;
+mod paper;
 pub mod params;
 pub mod placement;
 mod posegraph;

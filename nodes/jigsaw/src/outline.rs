@@ -339,26 +339,24 @@ impl Raster {
                 (square[k], nearest[k]) = (d, other);
             }
         };
-        for _ in 0..2 {
-            for r in 0..rows {
-                for c in 0..columns {
-                    for (dc, dr) in [(-1, 0), (0, -1), (-1, -1), (1, -1)] {
-                        relax(c, r, dc, dr);
-                    }
-                }
-                for c in (0..columns).rev() {
-                    relax(c, r, 1, 0);
+        for r in 0..rows {
+            for c in 0..columns {
+                for (dc, dr) in [(-1, 0), (0, -1), (-1, -1), (1, -1)] {
+                    relax(c, r, dc, dr);
                 }
             }
-            for r in (0..rows).rev() {
-                for c in (0..columns).rev() {
-                    for (dc, dr) in [(1, 0), (0, 1), (1, 1), (-1, 1)] {
-                        relax(c, r, dc, dr);
-                    }
+            for c in (0..columns).rev() {
+                relax(c, r, 1, 0);
+            }
+        }
+        for r in (0..rows).rev() {
+            for c in (0..columns).rev() {
+                for (dc, dr) in [(1, 0), (0, 1), (1, 1), (-1, 1)] {
+                    relax(c, r, dc, dr);
                 }
-                for c in 0..columns {
-                    relax(c, r, -1, 0);
-                }
+            }
+            for c in 0..columns {
+                relax(c, r, -1, 0);
             }
         }
         let mut distance = vec![0f32; columns * rows];

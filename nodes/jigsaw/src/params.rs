@@ -51,7 +51,7 @@ impl Default for Params {
             threads: 0,
             minimum_confidence: 0.5,
             candidates: 40,
-            backtracks: 10_000,
+            backtracks: 1000,
             loops: true,
             pose_graph: true,
             fit_clearance: true,

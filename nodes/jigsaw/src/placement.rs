@@ -22,6 +22,10 @@ pub(crate) const MAX_CLEARANCE: f64 = 0.03;
 pub(crate) const RESIDUAL_CAP: f64 = 0.02;
 /// Most that one iteration may turn, in radians.
 const MAX_TURN: f64 = 0.1;
+/// Weight of "no clearance" against that of all samples: enough where nothing else tells clearance from shift.
+const CLEARANCE_DAMPING: f64 = 0.002;
+/// Samples of the match segment for a rough pose.
+const ROUGH_SAMPLES: usize = 20;
 
 /// A refined contact of a tab and a mouth.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -42,7 +46,7 @@ pub(crate) struct Fit {
 }
 
 /// A pose during refinement: tab's local frame to mouth's local frame.
-#[derive(Debug, Clone, Copy)]
+#[derive(Debug, Clone, Copy, PartialEq)]
 struct Pose {
     cos: f64,
     sin: f64,
@@ -115,18 +119,24 @@ fn foot(run: &[Node], at: &mut usize, p: Vector2<f64>) -> Option<(f64, Vector2<f
     };
     let mut i = (*at).min(run.len() - 1);
     let mut best = square(i);
-    loop {
-        let mut moved = false;
-        // Two points ahead, so that a speck of noise doesn't stop the walk.
-        for k in [i + 1, i + 2, i.wrapping_sub(1), i.wrapping_sub(2)] {
-            if k < run.len() {
-                let d = square(k);
-                if d < best {
-                    (best, i, moved) = (d, k, true);
-                }
+    // Downhill in one direction, looking two points ahead so that a speck of noise doesn't stop the walk.
+    let from = i;
+    for direction in [1isize, -1] {
+        let mut k = from;
+        let mut misses = 0;
+        while misses < 2 {
+            k = k.wrapping_add_signed(direction);
+            if k >= run.len() {
+                break;
+            }
+            let d = square(k);
+            if d < best {
+                (best, i, misses) = (d, k, 0);
+            } else {
+                misses += 1;
             }
         }
-        if !moved {
+        if i != from {
             break;
         }
     }
@@ -159,6 +169,7 @@ fn foot(run: &[Node], at: &mut usize, p: Vector2<f64>) -> Option<(f64, Vector2<f
 struct Feet {
     at: Vec<usize>,
     rows: Vec<(f64, Vector2<f64>, Vector2<f64>)>,
+    off: Vec<f64>,
 }
 
 impl Feet {
@@ -171,10 +182,10 @@ impl Feet {
                 s.clamp(0.0, (mouth.run.len() - 1) as f64) as usize
             })
             .collect();
-        Self { at, rows: Vec::with_capacity(tab.run.len()) }
+        Self { at, rows: Vec::with_capacity(tab.run.len()), off: Vec::with_capacity(tab.run.len()) }
     }
 
-    fn find(&mut self, tab: &Segment, mouth: &Segment, range: std::ops::Range<usize>, pose: &Pose) {
+    fn find(&mut self, tab: &Segment, mouth: &Segment, range: impl Iterator<Item = usize>, pose: &Pose) {
         self.rows.clear();
         for k in range {
             let p = pose.apply(&tab.run[k]);
@@ -183,27 +194,34 @@ impl Feet {
             }
         }
     }
-}
 
-fn median_abs(values: impl Iterator<Item = f64>) -> f64 {
-    let mut v: Vec<f64> = values.map(f64::abs).collect();
-    if v.is_empty() {
-        return 0.0;
+    /// Mean capped residual.
+    fn residual(&self, clearance: f64, cap: f64) -> f64 {
+        self.rows.iter().map(|r| (r.0 - clearance).abs().min(cap)).sum::<f64>() / self.rows.len().max(1) as f64
     }
-    let middle = v.len() / 2;
-    *v.select_nth_unstable_by(middle, f64::total_cmp).1
+
+    fn spread(&mut self, clearance: f64) -> f64 {
+        self.off.clear();
+        self.off.extend(self.rows.iter().map(|r| (r.0 - clearance).abs()));
+        if self.off.is_empty() {
+            return 0.0;
+        }
+        let middle = self.off.len() / 2;
+        *self.off.select_nth_unstable_by(middle, f64::total_cmp).1
+    }
 }
 
 /// One step of weighted least squares; returns the normal matrix over (x, y, turn, clearance) about the local origin.
-fn step(feet: &Feet, pose: &mut Pose, clearance: &mut f64, free: bool, limit: f64) -> Matrix4<f64> {
-    let spread = median_abs(feet.rows.iter().map(|r| r.0 - *clearance));
-    let width = (3.0 * spread).max(1e-3);
+fn step(feet: &mut Feet, pose: &mut Pose, clearance: &mut f64, free: bool, limit: f64) -> Matrix4<f64> {
+    let width = (3.0 * feet.spread(*clearance)).max(1e-3);
     let mut h = Matrix4::zeros();
     let mut g = Vector4::zeros();
     let mut total = 0.0;
     for (distance, normal, p) in &feet.rows {
         let r = distance - *clearance;
-        let w = 1.0 / (1.0 + (r / width).powi(2)).powi(2);
+        let z = r / width;
+        let w = 1.0 / (1.0 + z * z);
+        let w = w * w;
         let j = Vector4::new(normal.x, normal.y, p.x * normal.y - p.y * normal.x, -1.0);
         h += j * j.transpose() * w;
         g += j * (w * r);
@@ -214,8 +232,12 @@ fn step(feet: &Feet, pose: &mut Pose, clearance: &mut f64, free: bool, limit: f6
     }
     let mut damped = h;
     // A prior of a few samples' weight keeps the clearance from sliding where the normals don't tell it from a shift.
-    damped[(3, 3)] += if free { 0.02 * total } else { 1e9 * total };
-    g[3] += if free { -0.02 * total * -*clearance } else { 0.0 };
+    if free {
+        damped[(3, 3)] += CLEARANCE_DAMPING * total;
+        g[3] += CLEARANCE_DAMPING * total * *clearance;
+    } else {
+        damped[(3, 3)] += 1e9 * total;
+    }
     for k in 0..2 {
         damped[(k, k)] += 1e-9 * total;
     }
@@ -230,51 +252,98 @@ fn step(feet: &Feet, pose: &mut Pose, clearance: &mut f64, free: bool, limit: f6
     h
 }
 
-/// Refines the pose of a tab in a mouth. `scale` is the piece scale, `free` whether the clearance is fitted.
-pub(crate) fn fit(tab: &Segment, mouth: &Segment, scale: f64, free: bool) -> Option<Fit> {
+/// A rough pose, from a few samples of the match segment alone.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(crate) struct Rough {
+    pose: Pose,
+    clearance: f64,
+    /// Mean capped residual of the few samples.
+    pub(crate) residual: f64,
+}
+
+/// Poses a tab in a mouth roughly: what is far off after this can't be a mating. `scale` is the piece scale, `free`
+/// whether the clearance is fitted.
+pub(crate) fn rough(tab: &Segment, mouth: &Segment, scale: f64, free: bool) -> Option<Rough> {
     if tab.core.len() < 4 || mouth.core.len() < 4 {
         return None;
     }
     let mut pose = first_pose(tab, mouth);
     let mut clearance = 0.0;
     let limit = MAX_CLEARANCE * scale;
-    let cap = RESIDUAL_CAP * scale;
+    let stride = (tab.core.len() / ROUGH_SAMPLES).max(1);
     let mut feet = Feet::new(tab, mouth);
     for round in 0..3 {
-        feet.find(tab, mouth, tab.core.clone(), &pose);
-        step(&feet, &mut pose, &mut clearance, free && round > 0, limit);
+        feet.find(tab, mouth, tab.core.clone().step_by(stride), &pose);
+        step(&mut feet, &mut pose, &mut clearance, free && round > 0, limit);
     }
+    feet.find(tab, mouth, tab.core.clone().step_by(stride), &pose);
+    if feet.rows.len() * stride < tab.core.len() / 2 {
+        return None;
+    }
+    Some(Rough { pose, clearance, residual: feet.residual(clearance, RESIDUAL_CAP * scale) })
+}
+
+/// Refines a rough pose on the extended match segment.
+pub(crate) fn refine(tab: &Segment, mouth: &Segment, from: &Rough, scale: f64, free: bool) -> Option<Fit> {
+    let Rough { mut pose, mut clearance, .. } = *from;
+    let limit = MAX_CLEARANCE * scale;
+    let cap = RESIDUAL_CAP * scale;
+    let mut feet = Feet::new(tab, mouth);
+    feet.find(tab, mouth, tab.core.clone(), &pose);
+    step(&mut feet, &mut pose, &mut clearance, free, limit);
     let mut h = Matrix4::zeros();
     for _ in 0..3 {
         feet.find(tab, mouth, 0..tab.run.len(), &pose);
-        h = step(&feet, &mut pose, &mut clearance, free, limit);
+        h = step(&mut feet, &mut pose, &mut clearance, free, limit);
     }
     feet.find(tab, mouth, 0..tab.run.len(), &pose);
     if feet.rows.len() < tab.core.len() / 2 {
         return None;
     }
-    let mean = |rows: &[(f64, Vector2<f64>, Vector2<f64>)]| {
-        rows.iter().map(|r| (r.0 - clearance).abs().min(cap)).sum::<f64>() / rows.len().max(1) as f64
-    };
-    let residual = mean(&feet.rows);
+    let residual = feet.residual(clearance, cap);
     feet.find(tab, mouth, tab.core.clone(), &pose);
-    let ave_gap = mean(&feet.rows);
+    Some(fit_of(tab, mouth, &feet, &pose, clearance, residual, cap, reduced(&h, free)))
+}
+
+#[allow(clippy::too_many_arguments, reason = "the figures of one finished refinement")]
+fn fit_of(
+    tab: &Segment,
+    mouth: &Segment,
+    feet: &Feet,
+    pose: &Pose,
+    clearance: f64,
+    residual: f64,
+    cap: f64,
+    information: Matrix3<f64>,
+) -> Fit {
     let (mut pos_gap, mut neg_gap) = (0.0, 0.0);
     for (distance, ..) in &feet.rows {
         if *distance < 0.0 { pos_gap -= distance * tab.step } else { neg_gap += distance * tab.step }
     }
-    let information = reduced(&h, free);
     let rotation = nalgebra::UnitComplex::from_cos_sin_unchecked(pose.cos, pose.sin);
     let translation = mouth.origin.coords + Vector2::new(pose.x, pose.y) - rotation * tab.origin.coords;
-    Some(Fit {
+    Fit {
         negative_from_positive: Isometry2::from_parts(translation.into(), rotation),
         clearance,
         residual,
-        ave_gap,
+        ave_gap: feet.residual(clearance, cap),
         pos_gap,
         neg_gap,
         information,
-    })
+    }
+}
+
+/// The figures of a given pose, unrefined, with no clearance: for the rules of the paper.
+pub(crate) fn as_posed(tab: &Segment, mouth: &Segment, pose: &Isometry2<f64>, scale: f64) -> Option<Fit> {
+    let shift = pose * tab.origin - mouth.origin;
+    let pose = Pose { cos: pose.rotation.re, sin: pose.rotation.im, x: shift.x, y: shift.y };
+    let mut feet = Feet::new(tab, mouth);
+    feet.find(tab, mouth, tab.core.clone(), &pose);
+    if feet.rows.len() < tab.core.len() / 2 {
+        return None;
+    }
+    let residual = feet.residual(0.0, f64::INFINITY);
+    Some(fit_of(tab, mouth, &feet, &pose, 0.0, residual, RESIDUAL_CAP * scale, Matrix3::identity()))
 }
 
 /// Takes the clearance out of the normal matrix (Schur complement).

@@ -14,13 +14,15 @@
 use crate::loops::{self, Edge, Slot, Tolerance, conflict, difference};
 use crate::outline::{ClearancePrior, Contact, Outline, contact, overlap_area};
 use crate::posegraph::{Factor, minimise};
-use crate::{Params, placement};
+use crate::{Params, Policy, placement};
 use nalgebra::{Isometry2, Matrix3, Point2, Translation2, UnitComplex, Vector2};
 use std::collections::{BTreeMap, HashMap};
 use std::time::Instant;
 
 /// Overlap of two pieces that can't be a matter of drift or clearance, in squared piece scales.
 const OVERLAP: f64 = 0.02;
+/// The same for poses that are not refined, which are off by a degree.
+const UNREFINED_OVERLAP: f64 = 0.05;
 /// Loops of refined poses close to within this on real pieces (0.8 % and 0.44° measured); calibration tightens it.
 const LOOSE: Tolerance = Tolerance { position: 0.04, angle: 0.05 };
 /// A closure this many times the typical one is no closure.
@@ -29,6 +31,10 @@ const CLOSURE_FACTOR: f64 = 5.0;
 const TIGHT: Tolerance = Tolerance { position: 0.003, angle: 0.003 };
 /// Pose agreement of candidates with an island that has been adjusted.
 const AGREE: Tolerance = Tolerance { position: 0.05, angle: 0.08 };
+/// The same when calibrated, at least.
+const MIN_AGREE: Tolerance = Tolerance { position: 0.015, angle: 0.02 };
+/// Adjustments at the end: two bring the poses to a tenth of what the border's noise leaves.
+const FINAL_ROUNDS: usize = 2;
 /// Candidates of each mouth (and tab) that take part in loops: more and chance loops drown the true ones.
 const LOOP_RANKS: usize = 6;
 /// Candidates of each mouth and tab that take part in growth.
@@ -85,6 +91,37 @@ impl State {
     }
 }
 
+/// Costs (logarithms of residuals) of right candidates, and of the best wrong one beside each: mean and deviation.
+#[derive(Debug, Clone, Copy)]
+struct Model {
+    right: (f64, f64),
+    wrong: (f64, f64),
+}
+
+impl Model {
+    /// Logarithm of how much likelier a cost is for a right candidate than for the best wrong one of a mouth.
+    fn evidence(&self, cost: f64) -> f64 {
+        let density = |(mean, deviation): (f64, f64)| {
+            let z = (cost.max(self.right.0) - mean) / deviation;
+            -0.5 * z * z - f64::ln(deviation)
+        };
+        // Beyond the mean of the wrong ones the two densities cross again; there it is simply wrong.
+        if cost > self.wrong.0.max(self.right.0 + self.right.1) {
+            return -STRONG;
+        }
+        (density(self.right) - density(self.wrong)).clamp(-STRONG, STRONG)
+    }
+}
+
+/// Evidence beyond which more doesn't count (natural logarithm of odds).
+const STRONG: f64 = 12.0;
+/// Evidence of one more candidate that agrees on a pose, or of one closed loop: chance agreement is rarer than this.
+const AGREEMENT: f64 = 4.0;
+/// Evidence that a join must have: odds of fifty to one.
+const ACCEPT: f64 = 4.0;
+/// Evidence below which a candidate speaks against the pose it proposes.
+const IMPLAUSIBLE: f64 = -6.0;
+
 struct Assembler<'a> {
     outlines: &'a [&'a Outline],
     params: &'a Params,
@@ -94,8 +131,10 @@ struct Assembler<'a> {
     at: Vec<Vec<usize>>,
     scale: f64,
     prior: ClearancePrior,
-    /// Residual of a true mating: median and robust deviation of its logarithm.
-    typical: (f64, f64),
+    /// What true and false candidates cost.
+    model: Model,
+    /// How far poses of true candidates may differ from an adjusted island.
+    agree: Tolerance,
     state: State,
     backtracks: usize,
     partial: bool,
@@ -138,12 +177,19 @@ pub(crate) fn assemble(outlines: &[&Outline], joints: &[Joint], params: &Params,
         at,
         scale,
         prior: ClearancePrior { mean: 0.0, deviation: 0.01 * scale, noise: noise.max(0.02) },
-        typical: ((1.5 * noise + 0.001 * scale).ln(), 0.5),
+        model: Model {
+            right: ((1.5 * noise + 0.001 * scale).ln(), 0.4),
+            wrong: ((1.5 * noise + 0.01 * scale).ln(), 0.5),
+        },
+        agree: AGREE,
         state: State::new(n),
         backtracks: 0,
         partial: false,
     };
-    assembler.run(joints)
+    match params.policy {
+        Policy::Standard => assembler.run(joints),
+        Policy::Paper => assembler.descend(joints),
+    }
 }
 
 /// Ranks the candidates of each mouth and tab by cost.
@@ -172,11 +218,60 @@ fn median(values: &mut [f64]) -> Option<f64> {
 
 impl Assembler<'_> {
     fn run(&mut self, joints: &[Joint]) -> Outcome {
+        let outstanding = self.outstanding();
+        self.learn(&outstanding);
         let found = if self.params.loops { self.close_loops(joints) } else { Vec::new() };
         self.islands(&found);
-        self.refine_all(2);
+        let trusted: Vec<usize> = self.state.joined.clone();
+        self.learn(&trusted);
+        self.refine_all(1);
         self.grow();
         self.verify();
+        self.improve();
+        self.refine_all(FINAL_ROUNDS);
+        self.finish(joints)
+    }
+
+    /// The paper's assembly: down the ranked table, mating whatever fits without intolerable overlap; when pieces are
+    /// left that can't be joined up, back. Decisions are taken back by limited discrepancy search (Harvey and
+    /// Ginsberg 1995): every descent that differs from the greedy one in one decision, the weakest first, then in two.
+    fn descend(&mut self, joints: &[Joint]) -> Outcome {
+        let n = self.outlines.len();
+        let mut ranked: Vec<usize> = (0..self.edges.len()).collect();
+        ranked.sort_by(|p, q| self.edges[*p].cost.total_cmp(&self.edges[*q].cost).then(p.cmp(q)));
+        let mut queue = std::collections::VecDeque::from([Vec::new()]);
+        let mut best: Option<(usize, State)> = None;
+        while let Some(skipped) = queue.pop_front() {
+            self.state = State::new(n);
+            let mut decisions = Vec::new();
+            for &k in &ranked {
+                if !skipped.contains(&k) && !self.same_island(k) && self.join(k) {
+                    decisions.push(k);
+                }
+            }
+            let placed = self.state.members.iter().map(Vec::len).max().unwrap_or(0);
+            if best.as_ref().is_none_or(|b| placed > b.0) {
+                best = Some((placed, self.state.clone()));
+            }
+            if placed == n || self.backtracks >= self.params.backtracks || self.late() {
+                break;
+            }
+            self.backtracks += 1;
+            // Each set of decisions once: only later ones than the last taken back are added to a set.
+            let last = skipped.last().and_then(|k| ranked.iter().position(|r| r == k));
+            for &k in decisions.iter().rev() {
+                if last.is_none_or(|l| ranked.iter().position(|r| *r == k).is_some_and(|r| r > l)) {
+                    let mut more = skipped.clone();
+                    more.push(k);
+                    queue.push_back(more);
+                }
+            }
+        }
+        if let Some((_, state)) = best {
+            self.state = state;
+        }
+        let trusted = self.state.joined.clone();
+        self.learn(&trusted);
         self.finish(joints)
     }
 
@@ -214,6 +309,12 @@ impl Assembler<'_> {
             supported.dedup();
             self.calibrate(joints, &supported);
             rank(&mut self.edges);
+            self.learn(&supported);
+            // Two steps of a loop err more than one; an island's drift is not known, so it may be twice that.
+            self.agree = Tolerance {
+                position: (2.0 * tolerance.position).clamp(MIN_AGREE.position, AGREE.position),
+                angle: (2.0 * tolerance.angle).clamp(MIN_AGREE.angle, AGREE.angle),
+            };
         }
         let active = self.active();
         let mut found = loops::find(&self.edges, &active, self.outlines, tolerance);
@@ -242,14 +343,52 @@ impl Assembler<'_> {
         // Small sets measure the deviation badly, and clearances may differ from cut to cut.
         self.prior.mean = mean;
         self.prior.deviation = deviation.max(0.002 * self.scale);
-        let mut residuals: Vec<f64> = supported.iter().map(|k| joints[*k].fit.residual.max(1e-4).ln()).collect();
-        let middle = median(&mut residuals).unwrap_or(self.typical.0);
-        let mut off: Vec<f64> = residuals.iter().map(|c| (c - middle).abs()).collect();
-        self.typical = (middle, (1.48 * median(&mut off).unwrap_or(0.3)).clamp(0.15, 0.6));
         for (k, e) in self.edges.iter_mut().enumerate() {
             let z = (joints[k].fit.clearance - mean) / self.prior.deviation;
             e.cost = joints[k].fit.residual.max(1e-4).ln() + 0.06 * (z * z).min(9.0);
         }
+    }
+
+    /// Learns what right and wrong candidates cost: right ones are those `trusted`, wrong ones the best others of
+    /// their mouths.
+    fn learn(&mut self, trusted: &[usize]) {
+        /// Fewer say too little about the spread.
+        const FEW: usize = 4;
+        let mut right: Vec<f64> = trusted.iter().map(|k| self.edges[*k].cost).collect();
+        let mut wrong = Vec::new();
+        for &k in trusted {
+            let mouth = self.edges[k].slots()[1];
+            let others = self.at[mouth.piece].iter().map(|j| (*j, &self.edges[*j]));
+            let best =
+                others.filter(|(j, e)| *j != k && e.slots()[1] == mouth).map(|(_, e)| e.cost).min_by(f64::total_cmp);
+            wrong.extend(best);
+        }
+        if right.len() < FEW || wrong.len() < FEW {
+            return;
+        }
+        let fit = |values: &mut Vec<f64>, low: f64, high: f64| {
+            let middle = median(values).unwrap_or(0.0);
+            let mut off: Vec<f64> = values.iter().map(|v| (v - middle).abs()).collect();
+            (middle, (1.48 * median(&mut off).unwrap_or(low)).clamp(low, high))
+        };
+        // Widths: never so narrow that a good candidate looks bad, never so wide that everything looks alike.
+        self.model = Model { right: fit(&mut right, 0.15, 0.5), wrong: fit(&mut wrong, 0.2, 0.7) };
+    }
+
+    /// Candidates that are the best of their tab and of their mouth by a wide margin: what to learn from without loops.
+    fn outstanding(&self) -> Vec<usize> {
+        const WIDE: f64 = 0.7; // half the residual of any rival
+        (0..self.edges.len())
+            .filter(|&k| {
+                let e = &self.edges[k];
+                let clear = |slot: Slot| {
+                    self.at[slot.piece].iter().all(|j| {
+                        *j == k || !self.edges[*j].slots().contains(&slot) || self.edges[*j].cost > e.cost + WIDE
+                    })
+                };
+                e.mouth_rank == 0 && e.tab_rank == 0 && e.slots().into_iter().all(clear)
+            })
+            .collect()
     }
 
     fn islands(&mut self, found: &[loops::Loop]) {
@@ -302,7 +441,7 @@ impl Assembler<'_> {
         let e = &self.edges[k];
         let actual = self.state.pose[e.b].inverse() * self.state.pose[e.a];
         let (d, turn) = difference(self.outlines[e.a], &actual, &e.b_from_a);
-        d <= AGREE.position && turn <= AGREE.angle
+        d <= self.agree.position && turn <= self.agree.angle
     }
 
     /// Joins the islands of a candidate; false if they contradict.
@@ -335,7 +474,7 @@ impl Assembler<'_> {
 
     /// Moves the smaller of two islands into the frame of the other, unless they overlap.
     fn merge(&mut self, ia: usize, ib: usize, b_from_a: &Isometry2<f64>) -> bool {
-        if self.islands_overlap(ia, ib, b_from_a) > OVERLAP {
+        if self.islands_overlap(ia, ib, b_from_a) > self.tolerated() {
             return false;
         }
         let (from, to, motion) = if self.state.members[ia].len() <= self.state.members[ib].len() {
@@ -351,11 +490,20 @@ impl Assembler<'_> {
         self.state.members[to].extend(moved);
         // Drift grows with the way through the island; adjusting at every doubling keeps it small at little cost.
         let size = self.state.members[to].len();
-        if self.params.pose_graph && size >= 6 && size >= 3 * self.state.refined[to].max(2) / 2 {
+        if self.params.pose_graph
+            && self.params.policy == Policy::Standard
+            && size >= 6
+            && size >= 3 * self.state.refined[to].max(2) / 2
+        {
             self.state.refined[to] = size;
             self.adjust(to);
         }
         true
+    }
+
+    /// Overlap that is tolerated when islands are joined.
+    fn tolerated(&self) -> f64 {
+        if self.params.policy == Policy::Paper { UNREFINED_OVERLAP } else { OVERLAP }
     }
 
     /// Greatest overlap of two pieces of different islands, in squared piece scales.
@@ -373,7 +521,7 @@ impl Assembler<'_> {
                 let q_from_p = self.state.pose[q].inverse() * pose;
                 let area = overlap_area(self.outlines[p], self.outlines[q], &q_from_p);
                 worst = worst.max(area / (self.outlines[p].scale * self.outlines[q].scale));
-                if worst > OVERLAP {
+                if worst > self.tolerated() {
                     return worst;
                 }
             }
@@ -477,11 +625,12 @@ impl Assembler<'_> {
                 return;
             }
             let mut hypotheses = self.hypotheses();
-            hypotheses.sort_by(|p, q| q.0.cmp(&p.0).then(p.1.total_cmp(&q.1)).then(p.2.cmp(&q.2)));
+            hypotheses.sort_by(|p, q| q.0.total_cmp(&p.0).then_with(|| p.1.cmp(&q.1)));
             let mut joined = 0;
-            for (_, _, members) in hypotheses {
-                // Earlier joins may have changed what is admissible; `join` checks again.
-                if self.same_island(members[0]) {
+            for (_, members) in hypotheses {
+                // Earlier joins may have changed what is admissible; `join` checks again. A single candidate must
+                // still lead its rivals.
+                if self.same_island(members[0]) || (members.len() > 1 && members.iter().any(|k| !self.free(*k))) {
                     continue;
                 }
                 if self.join(members[0]) {
@@ -500,8 +649,8 @@ impl Assembler<'_> {
         }
     }
 
-    /// Ways to join two islands: agreeing candidates, their mean cost, the candidates.
-    fn hypotheses(&self) -> Vec<(usize, f64, Vec<usize>)> {
+    /// Ways to join two islands: the evidence, the candidates that agree.
+    fn hypotheses(&self) -> Vec<(f64, Vec<usize>)> {
         let mut between: BTreeMap<(usize, usize), Vec<usize>> = BTreeMap::new();
         for (k, e) in self.edges.iter().enumerate() {
             if e.mouth_rank.min(e.tab_rank) >= GROWTH_RANKS || self.same_island(k) || !self.free(k) {
@@ -541,40 +690,183 @@ impl Assembler<'_> {
                             .iter()
                             .all(|s| slots.iter().all(|t| !conflict(self.outlines[s.piece], *s, *t)))
                     });
-                    if j != i && distinct && d < AGREE.position && turn < AGREE.angle {
+                    if j != i && distinct && d < self.agree.position && turn < self.agree.angle {
                         group.push(*other);
                     }
                 }
-                let cost = group.iter().map(|k| self.edges[*k].cost).sum::<f64>() / group.len() as f64;
-                if group.len() > 1 || self.clear(*k) {
-                    found.push((group.len(), cost, group));
+                if let Some(evidence) = self.evidence(&group) {
+                    found.push((evidence, group));
                 }
             }
         }
         found
     }
 
-    /// A single candidate that may be believed: mutually best, as good as true ones are, and clear of its rivals.
-    fn clear(&self, k: usize) -> bool {
-        /// Rivals must cost this much more (natural logarithm of the residual).
-        const MARGIN: f64 = 0.25;
-        let e = &self.edges[k];
-        if e.cost > self.typical.0 + 3.0 * self.typical.1 {
-            return false;
+    /// Evidence that candidates which agree on a pose are right; `None` if it isn't enough to act on.
+    fn evidence(&self, group: &[usize]) -> Option<f64> {
+        let mut sum = AGREEMENT * (group.len() - 1) as f64;
+        for &k in group {
+            let own = self.model.evidence(self.edges[k].cost);
+            if own < IMPLAUSIBLE {
+                return None;
+            }
+            sum += own;
         }
-        let rival = |piece: usize, slot: Slot| {
-            self.at[piece].iter().any(|j| {
-                let other = &self.edges[*j];
-                *j != k && other.slots().contains(&slot) && other.cost < e.cost + MARGIN && self.free(*j)
-            })
-        };
-        let [tab, mouth] = e.slots();
-        !rival(e.a, tab) && !rival(e.b, mouth)
+        if group.len() == 1 {
+            sum = sum.min(self.lead(group[0]));
+        }
+        (sum >= ACCEPT).then_some(sum)
     }
 
-    /// Takes out what overlaps or doesn't follow its neighbours.
+    /// By how much a candidate leads its free rivals for the same tab or mouth, as evidence.
+    fn lead(&self, k: usize) -> f64 {
+        let e = &self.edges[k];
+        let own = self.model.evidence(e.cost);
+        let mut lead = STRONG;
+        for slot in e.slots() {
+            for &j in &self.at[slot.piece] {
+                let other = &self.edges[j];
+                if j == k
+                    || !other.slots().iter().any(|s| conflict(self.outlines[slot.piece], *s, slot))
+                    || !self.free(j)
+                {
+                    continue;
+                }
+                // Costs below the typical are alike as evidence, but between rivals the better one still leads.
+                let ahead = (own - self.model.evidence(other.cost)).max((other.cost - e.cost) / self.model.right.1);
+                lead = lead.min(ahead);
+            }
+        }
+        lead
+    }
+
+    /// Takes out pieces that overlap others, the less supported one of a pair; islands that fall apart are split.
     fn verify(&mut self) {
-        self.refine_all(2);
+        for _ in 0..4 {
+            let mut evict: Vec<usize> = Vec::new();
+            let joined = self.joined_at();
+            for island in 0..self.state.members.len() {
+                for (p, q) in self.neighbours(island) {
+                    let pose = self.state.pose[q].inverse() * self.state.pose[p];
+                    let area = overlap_area(self.outlines[p], self.outlines[q], &pose);
+                    if area <= OVERLAP * self.outlines[p].scale * self.outlines[q].scale {
+                        continue;
+                    }
+                    let weight = |k: usize| {
+                        joined[k].iter().map(|j| AGREEMENT + self.model.evidence(self.edges[*j].cost)).sum::<f64>()
+                    };
+                    evict.push(if weight(p) < weight(q) { p } else { q });
+                }
+            }
+            // Matings that the adjusted poses contradict hold nothing.
+            let broken: Vec<usize> = self.state.joined.iter().copied().filter(|k| !self.agrees(*k)).collect();
+            if evict.is_empty() && broken.is_empty() {
+                return;
+            }
+            self.detach(&evict, &broken);
+            self.refine_all(1);
+        }
+    }
+
+    /// Joined candidates at each piece.
+    fn joined_at(&self) -> Vec<Vec<usize>> {
+        let mut joined = vec![Vec::new(); self.outlines.len()];
+        for &k in &self.state.joined {
+            joined[self.edges[k].a].push(k);
+            joined[self.edges[k].b].push(k);
+        }
+        joined
+    }
+
+    /// Undoes all matings of some pieces and some more matings; what no longer hangs together becomes islands apart.
+    fn detach(&mut self, pieces: &[usize], matings: &[usize]) {
+        let edges = &self.edges;
+        self.state
+            .joined
+            .retain(|k| !matings.contains(k) && !pieces.contains(&edges[*k].a) && !pieces.contains(&edges[*k].b));
+        let joined = &self.state.joined;
+        self.state.used.retain(|_, k| joined.contains(k));
+        let n = self.outlines.len();
+        let at = self.joined_at();
+        let old = std::mem::replace(&mut self.state.members, vec![Vec::new(); n]);
+        let mut seen = vec![false; n];
+        for members in old {
+            for &root in &members {
+                if seen[root] {
+                    continue;
+                }
+                let mut part = vec![root];
+                seen[root] = true;
+                let mut next = 0;
+                while next < part.len() {
+                    for &k in &at[part[next]] {
+                        for piece in [self.edges[k].a, self.edges[k].b] {
+                            if !seen[piece] {
+                                seen[piece] = true;
+                                part.push(piece);
+                            }
+                        }
+                    }
+                    next += 1;
+                }
+                for &k in &part {
+                    self.state.island[k] = root;
+                }
+                self.state.refined[root] = part.len();
+                self.state.members[root] = part;
+            }
+        }
+    }
+
+    /// What the assembly is worth: the evidence of its matings.
+    fn worth(&self) -> f64 {
+        self.state.joined.iter().map(|k| AGREEMENT + self.model.evidence(self.edges[*k].cost)).sum()
+    }
+
+    /// Backtracking: a piece left over that would fit where another sits is tried in its place; what is worth less
+    /// than before is undone.
+    fn improve(&mut self) {
+        let mut tried = std::collections::HashSet::new();
+        loop {
+            let mut options: Vec<(f64, usize)> = (0..self.edges.len())
+                .filter(|k| !tried.contains(k) && !self.same_island(*k) && !self.free(*k))
+                .filter(|k| {
+                    let e = &self.edges[*k];
+                    let alone = |p: usize| self.state.members[self.state.island[p]].len() == 1;
+                    alone(e.a) || alone(e.b)
+                })
+                .map(|k| (self.model.evidence(self.edges[k].cost), k))
+                .filter(|(evidence, _)| *evidence > 0.0)
+                .collect();
+            options.sort_by(|p, q| q.0.total_cmp(&p.0).then(p.1.cmp(&q.1)));
+            let Some(&(_, k)) = options.first() else { return };
+            if self.backtracks >= self.params.backtracks || self.late() {
+                return;
+            }
+            tried.insert(k);
+            let saved = self.state.clone();
+            let before = self.worth();
+            let mut occupants = Vec::new();
+            for slot in self.edges[k].slots() {
+                for (other, j) in &self.state.used {
+                    if conflict(self.outlines[slot.piece], *other, slot) {
+                        let e = &self.edges[*j];
+                        occupants.push(if e.a == slot.piece { e.b } else { e.a });
+                    }
+                }
+            }
+            occupants.sort_unstable();
+            occupants.dedup();
+            self.detach(&occupants, &[]);
+            if self.join(k) {
+                self.grow();
+                self.verify();
+            }
+            if self.worth() <= before + 1e-9 {
+                self.state = saved;
+                self.backtracks += 1;
+            }
+        }
     }
 
     fn finish(&mut self, joints: &[Joint]) -> Outcome {
@@ -583,23 +875,30 @@ impl Assembler<'_> {
         let mut taken: HashMap<Slot, usize> = HashMap::new();
         let mut order: Vec<usize> = (0..self.edges.len()).filter(|k| self.same_island(*k) && self.agrees(*k)).collect();
         order.sort_by(|p, q| joints[*p].fit.residual.total_cmp(&joints[*q].fit.residual).then(p.cmp(q)));
+        // Contacts that agree with a piece's pose: each beyond the first confirms it.
+        let mut evidence = vec![0.0f64; n];
+        let mut chosen = Vec::new();
         for k in order {
             let slots = self.edges[k].slots();
-            let limit = self.typical.0 + 6.0 * self.typical.1;
-            if slots.iter().any(|s| taken.contains_key(s)) || self.edges[k].cost > limit {
+            let own = self.model.evidence(self.edges[k].cost);
+            let loops = self.edges[k].support.min(2) as f64 * AGREEMENT;
+            if slots.iter().any(|s| taken.contains_key(s)) || own + loops < IMPLAUSIBLE {
                 continue;
             }
             for s in slots {
                 taken.insert(s, k);
+                evidence[s.piece] += own.max(0.0) + AGREEMENT;
             }
-            matings.push((k, if self.edges[k].support > 0 { 0.99 } else { 0.9 }));
+            chosen.push(k);
         }
-        let mut confidence = vec![0.0f64; n];
-        for (k, c) in &matings {
-            for piece in [self.edges[*k].a, self.edges[*k].b] {
-                confidence[piece] = confidence[piece].max(*c);
-            }
+        let sure = |evidence: f64| 1.0 / (1.0 + (-evidence).exp());
+        for k in chosen {
+            let [tab, mouth] = self.edges[k].slots();
+            // The first contact of a piece confirms nothing beside itself.
+            let least = (evidence[tab.piece].min(evidence[mouth.piece]) - AGREEMENT).max(0.0);
+            matings.push((k, sure(least)));
         }
+        let confidence: Vec<f64> = evidence.iter().map(|e| sure((e - AGREEMENT).max(0.0))).collect();
         Outcome {
             poses: (0..n)
                 .map(|k| {

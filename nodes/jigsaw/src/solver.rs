@@ -1,10 +1,12 @@
 //! The incremental solver: pieces come and go, candidates are kept, a solution is made on demand.
 
 use crate::correlation::correlate;
+use crate::index::shape_distance;
 use crate::index::{Entry, Hit, Index, Windows};
 use crate::outline::{Outline, Segment};
+use crate::paper;
 use crate::search::{self, Joint, Outcome};
-use crate::{Assembly, Mating, Params, ParamsError, Piece, Placement, TableCounts, Timings, frame, placement};
+use crate::{Assembly, Mating, Params, ParamsError, Piece, Placement, Policy, TableCounts, Timings, frame, placement};
 use nalgebra::Isometry2;
 use rayon::prelude::*;
 use std::collections::HashMap;
@@ -116,7 +118,9 @@ pub enum SolverError {
 #[derive(Debug, Clone, Copy)]
 struct Match {
     hit: Hit,
-    /// `None` where the refinement failed: the two don't fit at all.
+    /// `None` where not even a rough pose was found.
+    rough: Option<placement::Rough>,
+    /// Refined pose, of the roughly best only.
     fit: Option<placement::Fit>,
 }
 
@@ -130,7 +134,17 @@ pub struct Solver {
     outlines: Vec<Option<Outline>>,
     /// For each piece and mouth the nearest tabs; `None` where they have to be looked for.
     matches: Vec<Option<Vec<Vec<Match>>>>,
-    candidates: Vec<Candidate>,
+    /// What the last solution was made from, for [`Solver::candidates`].
+    last: Option<Solution>,
+}
+
+/// What a solution was made from.
+#[derive(Debug, Clone)]
+struct Solution {
+    order: Vec<usize>,
+    joints: Vec<Joint>,
+    shape_distances: Vec<f64>,
+    outcome: Outcome,
 }
 
 impl Solver {
@@ -159,7 +173,7 @@ impl Solver {
             index_of: HashMap::new(),
             outlines: Vec::new(),
             matches: Vec::new(),
-            candidates: Vec::new(),
+            last: None,
         })
     }
 
@@ -171,11 +185,6 @@ impl Solver {
     /// The pieces; indices in results point here.
     pub fn pieces(&self) -> &[Piece] {
         &self.pieces
-    }
-
-    /// All candidates with their figures, as the last [`Solver::solve`] left them.
-    pub fn candidates(&self) -> &[Candidate] {
-        &self.candidates
     }
 
     /// Takes a piece in and returns its index. What it brings is matched by the next [`Solver::solve`].
@@ -218,7 +227,7 @@ impl Solver {
                 }
             }
         }
-        self.candidates.clear();
+        self.last = None;
         Some(self.pieces.remove(index))
     }
 
@@ -228,7 +237,7 @@ impl Solver {
         self.index_of.clear();
         self.outlines.clear();
         self.matches.clear();
-        self.candidates.clear();
+        self.last = None;
     }
 
     /// The best assembly of the pieces that are there.
@@ -254,17 +263,30 @@ impl Solver {
         self.outlines.par_iter_mut().enumerate().for_each(|(k, outline)| {
             outline.get_or_insert_with(|| Outline::new(&pieces[k]));
         });
-        self.match_new(&rank);
-        let (joints, places) = self.joints(&order, &rank);
+        let outlines: Vec<&Outline> = order.iter().filter_map(|k| self.outlines[*k].as_ref()).collect();
+        let (joints, shape_distances, table) = if self.params.policy == Policy::Paper {
+            let (joints, table) = paper::candidates(&outlines);
+            let distances = joints
+                .iter()
+                .map(|j| f64::from(shape_distance(&outlines[j.a].tabs[j.tab], &outlines[j.b].mouths[j.mouth])))
+                .collect();
+            (joints, distances, Some(table))
+        } else {
+            drop(outlines);
+            self.match_new(&rank);
+            let (joints, distances) = self.joints(&order, &rank);
+            (joints, distances, None)
+        };
         let matched = Instant::now();
         let outlines: Vec<&Outline> = order.iter().filter_map(|k| self.outlines[*k].as_ref()).collect();
         let outcome = search::assemble(&outlines, &joints, &self.params, deadline);
-        let mut assembly = self.report(&order, &outlines, &joints, &outcome);
-        self.explain(&joints, &places, &outcome, &order);
-        assembly.table = self.count(&joints, &outcome);
+        let mut assembly = report(&order, &outlines, &joints, &outcome);
+        assembly.table = table.unwrap_or_else(|| count(&outlines, &joints));
+        assembly.table.backtracks = outcome.backtracks;
         assembly.partial = outcome.partial;
         assembly.timings =
             Timings { matching: (matched - begin).as_secs_f64(), assembly: matched.elapsed().as_secs_f64() };
+        self.last = Some(Solution { order, joints, shape_distances, outcome });
         assembly
     }
 
@@ -304,75 +326,45 @@ impl Solver {
                         continue;
                     }
                     let tab = &outlines[hit.piece as usize].tabs[hit.tab as usize];
-                    let fit = placement::fit(tab, mouth, outline.scale, free);
-                    list.insert(place, Match { hit, fit });
+                    let rough = placement::rough(tab, mouth, outline.scale, free);
+                    list.insert(place, Match { hit, rough, fit: None });
                     list.truncate(keep);
+                }
+                for place in best_places(list, outline.scale) {
+                    let m = &mut list[place];
+                    if let (Some(rough), None) = (&m.rough, &m.fit) {
+                        let tab = &outlines[m.hit.piece as usize].tabs[m.hit.tab as usize];
+                        m.fit = placement::refine(tab, mouth, rough, outline.scale, free);
+                    }
                 }
             }
         });
     }
 
-    /// The candidates that could be refined, in ranks; and where each came from (piece, mouth, place in the list).
-    fn joints(&self, order: &[usize], rank: &[usize]) -> (Vec<Joint>, Vec<[usize; 3]>) {
+    /// The refined candidates in ranks, and their shape distances.
+    fn joints(&self, order: &[usize], rank: &[usize]) -> (Vec<Joint>, Vec<f64>) {
         let mut joints = Vec::new();
-        let mut places = Vec::new();
+        let mut distances = Vec::new();
         for &piece in order {
+            let scale = self.outlines[piece].as_ref().map_or(1.0, |o| o.scale);
             for (mouth, list) in self.matches[piece].iter().flatten().enumerate() {
-                for (place, m) in list.iter().enumerate() {
+                for place in best_places(list, scale) {
+                    let m = &list[place];
                     let Some(fit) = m.fit else { continue };
                     let (a, b) = (rank[m.hit.piece as usize], rank[piece]);
                     joints.push(Joint { a, tab: m.hit.tab as usize, b, mouth, fit });
-                    places.push([piece, mouth, place]);
+                    distances.push(f64::from(m.hit.distance));
                 }
             }
         }
-        (joints, places)
+        (joints, distances)
     }
 
-    fn report(&self, order: &[usize], outlines: &[&Outline], joints: &[Joint], outcome: &Outcome) -> Assembly {
-        let mut islands: std::collections::BTreeMap<usize, Vec<usize>> = std::collections::BTreeMap::new();
-        for (k, pose) in outcome.poses.iter().enumerate() {
-            if let Some((island, _)) = pose {
-                islands.entry(*island).or_default().push(k);
-            }
-        }
-        let mut islands: Vec<Vec<usize>> = islands.into_values().collect();
-        islands.sort_by(|p, q| q.len().cmp(&p.len()).then(p.cmp(q)));
-        let poses: Vec<Isometry2<f64>> =
-            outcome.poses.iter().map(|p| p.map_or_else(Isometry2::identity, |p| p.1)).collect();
-        let mut assembly = Assembly::default();
-        let mut placed = vec![false; order.len()];
-        for (component, (members, motion)) in frame::lay_out(outlines, &poses, &islands).into_iter().enumerate() {
-            for k in members {
-                placed[k] = true;
-                assembly.placements.push(Placement {
-                    piece: order[k],
-                    puzzle_from_image: motion * poses[k],
-                    component,
-                    confidence: outcome.confidence[k],
-                });
-            }
-        }
-        assembly.unplaced = (0..order.len()).filter(|k| !placed[*k]).map(|k| order[k]).collect();
-        for (k, confidence) in &outcome.matings {
-            let j = &joints[*k];
-            let (tab, mouth) = (&outlines[j.a].tabs[j.tab], &outlines[j.b].mouths[j.mouth]);
-            assembly.matings.push(Mating {
-                positive_piece: order[j.a],
-                positive_isthmus: tab.isthmus,
-                negative_piece: order[j.b],
-                negative_isthmus: mouth.isthmus,
-                correlation: correlation_of(tab, mouth),
-                ave_gap: j.fit.ave_gap,
-                clearance: j.fit.clearance,
-                confidence: *confidence,
-            });
-        }
-        assembly
-    }
-
-    /// The candidate table with what became of each.
-    fn explain(&mut self, joints: &[Joint], places: &[[usize; 3]], outcome: &Outcome, order: &[usize]) {
+    /// The candidate table of the last [`Solver::solve`]: each refined candidate with its figures and its fate. What
+    /// the windows and the shape index drop before is counted in [`Assembly::table`] only.
+    pub fn candidates(&self) -> Vec<Candidate> {
+        let Some(Solution { order, joints, shape_distances, outcome }) = &self.last else { return Vec::new() };
+        let outlines: Vec<&Outline> = order.iter().filter_map(|k| self.outlines[*k].as_ref()).collect();
         let mut mated = vec![false; joints.len()];
         let mut taken = std::collections::HashSet::new();
         for (k, _) in &outcome.matings {
@@ -381,84 +373,139 @@ impl Solver {
             taken.insert((true, j.a, j.tab));
             taken.insert((false, j.b, j.mouth));
         }
-        let pieces: Vec<&Outline> = self.outlines.iter().flatten().collect();
-        let matches = &self.matches;
-        self.candidates = joints
-            .par_iter()
-            .enumerate()
-            .map(|(k, j)| {
-                let scale = pieces[order[j.b]].scale;
-                let (tab, mouth) = (&pieces[order[j.a]].tabs[j.tab], &pieces[order[j.b]].mouths[j.mouth]);
-                let rival = taken.contains(&(true, j.a, j.tab)) || taken.contains(&(false, j.b, j.mouth));
-                let fate = if mated[k] {
-                    Fate::Mated
-                } else if j.fit.residual > HOPELESS * placement::RESIDUAL_CAP * scale {
-                    Fate::Dropped(Rule::Overlap)
-                } else if rival {
-                    Fate::Dropped(Rule::Rival)
-                } else {
-                    Fate::Dropped(Rule::Support)
-                };
-                let [piece, list, place] = places[k];
-                let hit = matches[piece].as_ref().map(|lists| lists[list][place].hit);
-                Candidate {
-                    positive_piece: order[j.a],
-                    positive_isthmus: tab.isthmus,
-                    negative_piece: order[j.b],
-                    negative_isthmus: mouth.isthmus,
-                    opening: mouth.width - tab.width,
-                    path_difference: mouth.path - tab.path,
-                    shape_distance: hit.map_or(f64::INFINITY, |h| f64::from(h.distance)),
-                    correlation: correlation_of(tab, mouth),
-                    pos_gap: j.fit.pos_gap,
-                    neg_gap: j.fit.neg_gap,
-                    ave_gap: j.fit.ave_gap,
-                    clearance: j.fit.clearance,
-                    support: outcome.support[k],
-                    negative_from_positive: j.fit.negative_from_positive,
-                    fate,
-                }
-            })
-            .collect();
+        let describe = |(k, j): (usize, &Joint)| {
+            let (tab, mouth) = (&outlines[j.a].tabs[j.tab], &outlines[j.b].mouths[j.mouth]);
+            let rival = taken.contains(&(true, j.a, j.tab)) || taken.contains(&(false, j.b, j.mouth));
+            let fate = if mated[k] {
+                Fate::Mated
+            } else if hopeless(j, outlines[j.b]) {
+                Fate::Dropped(Rule::Overlap)
+            } else if rival {
+                Fate::Dropped(Rule::Rival)
+            } else {
+                Fate::Dropped(Rule::Support)
+            };
+            Candidate {
+                positive_piece: order[j.a],
+                positive_isthmus: tab.isthmus,
+                negative_piece: order[j.b],
+                negative_isthmus: mouth.isthmus,
+                opening: mouth.width - tab.width,
+                path_difference: mouth.path - tab.path,
+                shape_distance: shape_distances[k],
+                correlation: correlation_of(tab, mouth),
+                pos_gap: j.fit.pos_gap,
+                neg_gap: j.fit.neg_gap,
+                ave_gap: j.fit.ave_gap,
+                clearance: j.fit.clearance,
+                support: outcome.support[k],
+                negative_from_positive: j.fit.negative_from_positive,
+                fate,
+            }
+        };
+        joints.par_iter().enumerate().map(describe).collect()
     }
+}
 
-    /// Counts of the candidate table: windows counted on sorted widths, the rest on the candidates themselves.
-    fn count(&self, joints: &[Joint], outcome: &Outcome) -> TableCounts {
-        let outlines: Vec<&Outline> = self.outlines.iter().flatten().collect();
-        let mut tabs: Vec<(f64, f64)> =
-            outlines.iter().flat_map(|o| o.tabs.iter().map(|t| (t.width, t.path))).collect();
-        tabs.sort_by(|p, q| p.0.total_cmp(&q.0));
-        let negative: usize = outlines.iter().map(|o| o.mouths.len()).sum();
-        let same: usize = outlines.iter().map(|o| o.mouths.len() * o.tabs.len()).sum();
-        let within = |v: f64, w: (f64, f64)| v >= w.0 && v <= w.1;
-        let (after_opening, after_length) = outlines
-            .par_iter()
-            .map(|o| {
-                let w = windows(o);
-                let (mut opening, mut length) = (0, 0);
-                for m in &o.mouths {
-                    let from = tabs.partition_point(|t| m.width - t.0 > w.opening.1);
-                    let to = tabs.partition_point(|t| m.width - t.0 >= w.opening.0);
-                    let own: Vec<&Segment> = o.tabs.iter().filter(|t| within(m.width - t.width, w.opening)).collect();
-                    opening += (to - from) - own.len();
-                    length += tabs[from..to].iter().filter(|t| within(m.path - t.1, w.path)).count()
-                        - own.iter().filter(|t| within(m.path - t.path, w.path)).count();
-                }
-                (opening, length)
-            })
-            .reduce(|| (0, 0), |p, q| (p.0 + q.0, p.1 + q.1));
-        let overlapping = self.candidates.iter().filter(|c| c.fate == Fate::Dropped(Rule::Overlap)).count();
-        TableCounts {
-            positive: tabs.len(),
-            negative,
-            pairs: tabs.len() * negative - same,
-            after_opening,
-            after_length,
-            after_correlation: joints.len(),
-            after_overlap: joints.len() - overlapping,
-            backtracks: outcome.backtracks,
+/// Whether the borders of a candidate don't follow each other at all.
+fn hopeless(joint: &Joint, mouth: &Outline) -> bool {
+    joint.fit.residual > HOPELESS * placement::RESIDUAL_CAP * mouth.scale
+}
+
+/// Turns ranks into indices and lays the islands out.
+fn report(order: &[usize], outlines: &[&Outline], joints: &[Joint], outcome: &Outcome) -> Assembly {
+    let mut islands: std::collections::BTreeMap<usize, Vec<usize>> = std::collections::BTreeMap::new();
+    for (k, pose) in outcome.poses.iter().enumerate() {
+        if let Some((island, _)) = pose {
+            islands.entry(*island).or_default().push(k);
         }
     }
+    let mut islands: Vec<Vec<usize>> = islands.into_values().collect();
+    islands.sort_by(|p, q| q.len().cmp(&p.len()).then(p.cmp(q)));
+    let poses: Vec<Isometry2<f64>> =
+        outcome.poses.iter().map(|p| p.map_or_else(Isometry2::identity, |p| p.1)).collect();
+    let mut assembly = Assembly::default();
+    let mut placed = vec![false; order.len()];
+    for (component, (members, motion)) in frame::lay_out(outlines, &poses, &islands).into_iter().enumerate() {
+        for k in members {
+            placed[k] = true;
+            assembly.placements.push(Placement {
+                piece: order[k],
+                puzzle_from_image: motion * poses[k],
+                component,
+                confidence: outcome.confidence[k],
+            });
+        }
+    }
+    assembly.unplaced = (0..order.len()).filter(|k| !placed[*k]).map(|k| order[k]).collect();
+    for (k, confidence) in &outcome.matings {
+        let j = &joints[*k];
+        let (tab, mouth) = (&outlines[j.a].tabs[j.tab], &outlines[j.b].mouths[j.mouth]);
+        assembly.matings.push(Mating {
+            positive_piece: order[j.a],
+            positive_isthmus: tab.isthmus,
+            negative_piece: order[j.b],
+            negative_isthmus: mouth.isthmus,
+            correlation: correlation_of(tab, mouth),
+            ave_gap: j.fit.ave_gap,
+            clearance: j.fit.clearance,
+            confidence: *confidence,
+        });
+    }
+    assembly
+}
+
+/// Counts of the candidate table: windows counted on sorted widths, the rest on the candidates themselves.
+fn count(outlines: &[&Outline], joints: &[Joint]) -> TableCounts {
+    let mut tabs: Vec<(f64, f64)> = outlines.iter().flat_map(|o| o.tabs.iter().map(|t| (t.width, t.path))).collect();
+    tabs.sort_by(|p, q| p.0.total_cmp(&q.0));
+    let negative: usize = outlines.iter().map(|o| o.mouths.len()).sum();
+    let same: usize = outlines.iter().map(|o| o.mouths.len() * o.tabs.len()).sum();
+    let within = |v: f64, w: (f64, f64)| v >= w.0 && v <= w.1;
+    let (after_opening, after_length) = outlines
+        .par_iter()
+        .map(|o| {
+            let w = windows(o);
+            let (mut opening, mut length) = (0, 0);
+            for m in &o.mouths {
+                let from = tabs.partition_point(|t| m.width - t.0 > w.opening.1);
+                let to = tabs.partition_point(|t| m.width - t.0 >= w.opening.0);
+                let own: Vec<&Segment> = o.tabs.iter().filter(|t| within(m.width - t.width, w.opening)).collect();
+                opening += (to - from) - own.len();
+                length += tabs[from..to].iter().filter(|t| within(m.path - t.1, w.path)).count()
+                    - own.iter().filter(|t| within(m.path - t.path, w.path)).count();
+            }
+            (opening, length)
+        })
+        .reduce(|| (0, 0), |p, q| (p.0 + q.0, p.1 + q.1));
+    let hopeless = joints.iter().filter(|j| hopeless(j, outlines[j.b])).count();
+    TableCounts {
+        positive: tabs.len(),
+        negative,
+        pairs: tabs.len() * negative - same,
+        after_opening,
+        after_length,
+        after_correlation: joints.len(),
+        after_overlap: joints.len() - hopeless,
+        backtracks: 0,
+    }
+}
+
+/// Candidates of a mouth that are refined in any case.
+const REFINED: usize = 4;
+/// More are refined if their rough residual is at most this many times the best one's, and this much more, in piece
+/// scales: what a rough pose may be off.
+const ROUGHLY: (f64, f64) = (2.5, 0.003);
+
+/// Places in a mouth's list of the candidates to refine, best rough pose first.
+fn best_places(list: &[Match], scale: f64) -> Vec<usize> {
+    let residual = |k: &usize| list[*k].rough.map_or(f64::INFINITY, |r| r.residual);
+    let mut places: Vec<usize> = (0..list.len()).filter(|k| list[*k].rough.is_some()).collect();
+    places.sort_by(|p, q| residual(p).total_cmp(&residual(q)).then(list[*p].hit.order(&list[*q].hit)));
+    let limit = places.first().map_or(0.0, |k| ROUGHLY.0 * residual(k) + ROUGHLY.1 * scale);
+    let near = places.partition_point(|k| residual(k) <= limit);
+    places.truncate(near.max(REFINED));
+    places
 }
 
 /// A mean residual above this part of the cap means that the borders don't follow each other at all.

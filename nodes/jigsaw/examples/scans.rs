@@ -1,0 +1,118 @@
+//! The solver on folders of real pieces, one silhouette an image (bright on dark).
+//!
+//! `cargo run --release -p jigsaw --example scans -- FOLDER [--truth solution.csv] [--off SWITCH]`
+//! The truth has the columns piece (file stem), column, row, rotation_rad.
+
+use anyhow::{Context, bail};
+use isthmus::mask::{Aoi, Cutout};
+use jigsaw::{Params, Piece, Solver};
+use rayon::prelude::*;
+use std::collections::HashMap;
+use std::path::{Path, PathBuf};
+use std::time::Instant;
+
+fn load(path: &Path) -> anyhow::Result<Piece> {
+    let picture = image::open(path).with_context(|| path.display().to_string())?.to_luma8();
+    let (width, height) = picture.dimensions();
+    let window = Aoi { x: 0, y: 0, width, height };
+    let cutout = Cutout {
+        aoi: window,
+        window,
+        pixels: picture.into_raw(),
+        shape_level: 255.0,
+        ground_level: 0.0,
+        noise_level: 0.0,
+    };
+    let features = isthmus::Extractor::default().extract(&cutout).with_context(|| path.display().to_string())?;
+    let id = path.file_stem().and_then(|s| s.to_str()).context("file name")?.to_owned();
+    Ok(Piece { id, features })
+}
+
+fn main() -> anyhow::Result<()> {
+    let mut folder = None;
+    let mut truth = None;
+    let mut params = Params::default();
+    let mut arguments = std::env::args().skip(1);
+    while let Some(argument) = arguments.next() {
+        match argument.as_str() {
+            "--truth" => truth = arguments.next().map(PathBuf::from),
+            "--off" => match arguments.next().as_deref() {
+                Some("loops") => params.loops = false,
+                Some("pose_graph") => params.pose_graph = false,
+                Some("fit_clearance") => params.fit_clearance = false,
+                Some("recalibrate") => params.recalibrate = false,
+                Some("merge_islands") => params.merge_islands = false,
+                other => bail!("unknown switch {other:?}"),
+            },
+            "--candidates" => params.candidates = arguments.next().context("--candidates N")?.parse()?,
+            path => folder = Some(PathBuf::from(path)),
+        }
+    }
+    let folder = folder.context("no folder")?;
+    let begin = Instant::now();
+    let mut files: Vec<PathBuf> = std::fs::read_dir(&folder)?.map(|e| e.map(|e| e.path())).collect::<Result<_, _>>()?;
+    files.retain(|f| f.extension().is_some_and(|e| ["png", "jpg", "jpeg", "bmp"].iter().any(|x| e == *x)));
+    files.sort();
+    let pieces: Vec<Piece> = files.par_iter().map(|f| load(f)).collect::<Result<_, _>>()?;
+    println!("{} pieces, features {:.2} s", pieces.len(), begin.elapsed().as_secs_f64());
+    let mut solver = Solver::new(params)?;
+    for piece in &pieces {
+        solver.insert(piece.clone())?;
+    }
+    let assembly = solver.solve();
+    let components = assembly.placements.iter().map(|p| p.component).max().map_or(0, |c| c + 1);
+    let sizes: Vec<usize> =
+        (0..components).map(|c| assembly.placements.iter().filter(|p| p.component == c).count()).collect();
+    println!("components {sizes:?}, matings {}, unplaced {}", assembly.matings.len(), assembly.unplaced.len());
+    println!("{:?}\n{:?}", assembly.table, assembly.timings);
+    let residual = assembly.matings.iter().map(|m| m.ave_gap).sum::<f64>() / assembly.matings.len().max(1) as f64;
+    let mut clearances: Vec<f64> = assembly.matings.iter().map(|m| m.clearance).collect();
+    clearances.sort_by(f64::total_cmp);
+    println!(
+        "mean gap {residual:.2} px, clearance {:?}",
+        [0.05, 0.5, 0.95].map(|q| clearances.get((q * clearances.len() as f64) as usize))
+    );
+    if let Some(truth) = truth {
+        let text = std::fs::read_to_string(truth)?;
+        let mut cell = HashMap::new();
+        for line in text.lines().skip(1) {
+            let f: Vec<&str> = line.split(',').collect();
+            cell.insert(f[0].to_owned(), (f[1].parse::<i64>()?, f[2].parse::<i64>()?, f[3].parse::<f64>()?));
+        }
+        let at = |k: usize| cell.get(&pieces[k].id).copied();
+        let mut wrong = 0;
+        for m in &assembly.matings {
+            if let (Some(a), Some(b)) = (at(m.positive_piece), at(m.negative_piece))
+                && (a.0 - b.0).abs() + (a.1 - b.1).abs() != 1
+            {
+                wrong += 1;
+                println!("wrong mating {} {} {m:?}", pieces[m.positive_piece].id, pieces[m.negative_piece].id);
+            }
+        }
+        let joints = cell.values().filter(|a| cell.values().any(|b| b.0 == a.0 + 1 && b.1 == a.1)).count()
+            + cell.values().filter(|a| cell.values().any(|b| b.1 == a.1 + 1 && b.0 == a.0)).count();
+        println!("wrong matings {wrong} of {}; joints in all {joints}", assembly.matings.len());
+        // Rotation against truth in the main component: placement turns the piece by theta, truth says rotation.
+        for sign in [1.0, -1.0] {
+            let mut off: Vec<(f64, usize)> = assembly
+                .placements
+                .iter()
+                .filter(|p| p.component == 0)
+                .filter_map(|p| at(p.piece).map(|t| (p.puzzle_from_image.rotation.angle() - sign * t.2, p.piece)))
+                .collect();
+            let (s, c) = off.iter().fold((0.0, 0.0), |(s, c), a| (s + a.0.sin(), c + a.0.cos()));
+            let mean = s.atan2(c);
+            for a in &mut off {
+                a.0 = ((a.0 - mean + std::f64::consts::PI).rem_euclid(std::f64::consts::TAU) - std::f64::consts::PI)
+                    .abs();
+            }
+            off.sort_by(|p, q| q.0.total_cmp(&p.0));
+            let bad = off.iter().filter(|a| a.0 > 0.14).count();
+            println!("rotation against truth (sign {sign}): {bad} of {} off by over 8 degrees", off.len());
+            if bad < 12 {
+                off.iter().take(bad).for_each(|(a, k)| println!("  {} {a:.2}", pieces[*k].id));
+            }
+        }
+    }
+    Ok(())
+}
