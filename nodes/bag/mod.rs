@@ -2,7 +2,7 @@
 //!
 //! A bag is a folder with a `metadata.yaml` and one or more storage files, MCAP or sqlite3; a bare storage file is one
 //! too. Messages are raw CDR with its 4-byte header all the way: [`BagReader`] yields them ordered by time,
-//! [`BagWriter`] stores them, `play` publishes them over DDS and `record` subscribes them. Only [`cdr`] looks inside.
+//! [`BagWriter`] stores them, [`play`] publishes them over DDS and [`record`] subscribes them. Only [`cdr`] looks inside.
 //!
 //! ```text
 //! BagReader ── Messages (raw, by time) ── play ── DDS
@@ -13,12 +13,17 @@
 //! used, a [`BagError`] where not. Memory stays bounded by the constants of [`read`], whatever a file claims.
 
 pub mod cdr;
+pub mod cli;
+pub mod frames;
+pub mod play;
 pub mod qos;
 pub mod read;
+pub mod record;
 pub mod write;
 
 mod mcap;
 mod metadata;
+mod queues;
 mod sqlite;
 
 use std::path::PathBuf;

@@ -1,2 +1,25 @@
 //! jigsaw
-fn main() {}
+
+use std::process::ExitCode;
+
+use clap::{Parser, Subcommand};
+use jigsaw_nodes::bag::cli::BagCommand;
+
+#[derive(Parser)]
+#[command(version)]
+struct Cli {
+    #[command(subcommand)]
+    command: Command,
+}
+
+#[derive(Subcommand)]
+enum Command {
+    #[command(subcommand)]
+    Bag(BagCommand),
+}
+
+fn main() -> ExitCode {
+    match Cli::parse().command {
+        Command::Bag(command) => jigsaw_nodes::bag::cli::run(command),
+    }
+}

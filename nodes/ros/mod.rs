@@ -6,6 +6,7 @@
 //! | [`params`] | declaration, check and documentation of parameters |
 //! | [`services`] | the six parameter services |
 //! | [`topics`] | every topic: message type, name, quality of service |
+//! | [`raw`] | topics whose type is known by name only |
 //! | [`session`] | one node: opens topics and services as streams and sinks |
 //! | [`process`] | one process: signals, participant, watchdog, exit code |
 //! | [`logging`] | log lines to the console and `/rosout`, throttled warnings |
@@ -17,6 +18,7 @@ pub mod health;
 pub mod logging;
 pub mod params;
 pub mod process;
+pub mod raw;
 pub mod services;
 pub mod session;
 pub mod topics;

@@ -274,6 +274,12 @@ impl Session {
         Ok(receiver)
     }
 
+    /// Who listens to a writer that was opened beside the publishers of this session.
+    pub(super) fn audience_of(&self, writer: GUID, name: &str) -> Audience {
+        self.endpoints.opened(writer, name);
+        Audience { endpoints: self.endpoints.clone(), writer }
+    }
+
     fn dds_topic<M: Message>(&self, topic: &Topic<M>) -> Result<(String, rustdds::Topic), SessionError> {
         let name = self.names.topic(topic.name)?;
         let type_name = MessageTypeName::new(M::TYPE.package, M::TYPE.name);
