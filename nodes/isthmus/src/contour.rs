@@ -366,6 +366,9 @@ impl Tracer {
             return Err(ContourError::Contrast { shape_level, ground_level });
         }
         let level = (shape_level + ground_level) / 2.0;
+        if cutout.pixels.is_empty() {
+            return Err(ContourError::Nothing { level });
+        }
         let mut padded = std::mem::take(&mut self.padded);
         let margin = pad(cutout, level, &mut padded);
         let (width, height) = (width + 2 * margin, height + 2 * margin);

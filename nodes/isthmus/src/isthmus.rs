@@ -63,10 +63,18 @@ const MIN_PERSISTENCE_STEPS: f64 = 0.5;
 /// Least persistence in standard deviations of a border point: chance minima of a noisy neck have less (both ends of
 /// both chords vary, and there are many of them).
 const MIN_PERSISTENCE_NOISE: f64 = 6.0;
-/// Least persistence of a salient isthmus, as a part of its width.
-const SALIENT_PERSISTENCE: f64 = 0.04;
-/// Most area beyond the neck of a salient isthmus, as a part of the shape's: a lobe, not half the body.
-const SALIENT_AREA: f64 = 0.2;
+/// Least persistence of a salient neck, as a part of its width: the tabs of real pieces widen by a fifth at least, the waists
+/// between blanks and sides by less than a tenth as a rule.
+const SALIENT_NECK_PERSISTENCE: f64 = 0.12;
+/// Most area beyond a salient neck, as a part of the shape's: a lobe, not a limb of the body (tabs of real pieces have up to
+/// a tenth, the corner between two blanks more).
+const SALIENT_NECK_AREA: f64 = 0.13;
+/// Greatest width of a salient neck, as a part of the square root of the shape's area.
+const SALIENT_NECK_WIDTH: f64 = 0.32;
+/// Least persistence of a salient mouth, as a part of its width. There are few pockets that are no blanks.
+const SALIENT_MOUTH_PERSISTENCE: f64 = 0.04;
+/// Most area behind a salient mouth, as a part of the shape's.
+const SALIENT_MOUTH_AREA: f64 = 0.2;
 /// How far the chord's ends are tried, in steps, while it slides to its shortest.
 const SLIDE: isize = 3;
 /// Most slides of a chord: far more than a neck is long compared with [`SLIDE`]; guards against pathological borders.
@@ -106,18 +114,14 @@ fn persistent_saddles(border: &Border, triangulation: &Triangulation, noise: f64
     let outside = triangulation.discs.len();
     // Discs on (nearly) straight parts of the border have any radius, and rounding differs from one to the next: all that
     // are larger than the shape count as equally wide.
-    let cap = border.bounds().map_or(f64::INFINITY, |[low, high]| (high - low).norm());
+    let cap = triangulation.extent;
     let mut passages = Vec::with_capacity(triangulation.corners.len() / 2);
     for side in 0..triangulation.corners.len() {
         let neighbour = triangulation.neighbours[side];
         if neighbour != NO_NEIGHBOUR && neighbour < side {
             continue;
         }
-        let (here, there) = (side / 3, if neighbour == NO_NEIGHBOUR { outside } else { neighbour / 3 });
-        let polarity = |t: usize| triangulation.polarity.get(t).copied().unwrap_or(Polarity::Negative);
-        let [i, j] = triangulation.ends(side);
-        let step = i.abs_diff(j);
-        if polarity(here) == polarity(there) && step != 1 && step != n - 1 {
+        if triangulation.is_passage(side, n) {
             passages.push(Passage { radius: passage_radius(border, triangulation, side).min(cap), side });
         }
     }
@@ -216,7 +220,16 @@ fn isthmus_at(
     if !(width > 0.0 && path_length > width) {
         return None;
     }
-    let salient = persistence >= SALIENT_PERSISTENCE * width && lobe.abs() <= SALIENT_AREA * area;
+    let salient = match polarity {
+        Polarity::Positive => {
+            persistence >= SALIENT_NECK_PERSISTENCE * width
+                && lobe.abs() <= SALIENT_NECK_AREA * area
+                && width <= SALIENT_NECK_WIDTH * area.sqrt()
+        }
+        Polarity::Negative => {
+            persistence >= SALIENT_MOUTH_PERSISTENCE * width && lobe.abs() <= SALIENT_MOUTH_AREA * area
+        }
+    };
     Some(Isthmus {
         polarity,
         point: nalgebra::center(&p, &q),

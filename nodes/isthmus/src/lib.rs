@@ -19,6 +19,8 @@ pub mod mask;
 pub mod profile;
 pub mod skeleton;
 
+use crate::isthmus::Polarity;
+
 /// A point of the source frame: pixels, x right, y down, pixel centres at whole numbers.
 pub type Point = nalgebra::Point2<f64>;
 
@@ -84,12 +86,13 @@ impl Extractor {
     pub fn analyse(&mut self, border: contour::Border, noise: f64) -> Result<Features, Error> {
         self.triangulation.rebuild(&border)?;
         let isthmuses = isthmus::find(&border, &self.triangulation, noise);
-        Ok(Features {
-            border,
-            noise,
-            isthmuses,
-            endoskeleton: skeleton::Skeleton::default(),
-            exoskeleton: skeleton::Skeleton::default(),
-        })
+        let skeleton = |polarity| self.triangulation.skeleton(&border, polarity, noise);
+        let (endoskeleton, exoskeleton) = (skeleton(Polarity::Positive), skeleton(Polarity::Negative));
+        Ok(Features { border, noise, isthmuses, endoskeleton, exoskeleton })
     }
 }
+
+/// The examples of the README, compiled and run with the tests.
+#[cfg(doctest)]
+#[doc = include_str!("../README.md")]
+struct Readme;

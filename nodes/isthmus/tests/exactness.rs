@@ -1,5 +1,7 @@
 //! Necks that are known exactly are found, at the right place, on outlines and in pictures.
 
+#![allow(clippy::unwrap_used, reason = "test program: its functions beside the tests fail by panic too")]
+
 mod shapes;
 
 use isthmus::isthmus::Isthmus;

@@ -1,5 +1,7 @@
 //! Real scans: every piece is found with the default parameters. Skipped where the scans are missing.
 
+#![allow(clippy::unwrap_used, reason = "test program: its functions beside the tests fail by panic too")]
+
 use isthmus::Extractor;
 use isthmus::mask::{Frame, Parameters, segment};
 use std::path::{Path, PathBuf};
