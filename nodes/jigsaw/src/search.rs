@@ -119,8 +119,12 @@ const STRONG: f64 = 12.0;
 const AGREEMENT: f64 = 4.0;
 /// Evidence that a join must have: odds of fifty to one.
 const ACCEPT: f64 = 4.0;
-/// Evidence below which a candidate speaks against the pose it proposes.
+/// Evidence below which a candidate is no mating, whatever supports it.
 const IMPLAUSIBLE: f64 = -6.0;
+/// Most that one candidate counts against the pose that it shares with others.
+const WORN: f64 = -3.0;
+/// How much farther apart the poses of two candidates may be for each scale that lies between them (their turn).
+const SWING: f64 = 0.008;
 
 struct Assembler<'a> {
     outlines: &'a [&'a Outline],
@@ -463,6 +467,35 @@ impl Assembler<'_> {
         true
     }
 
+    /// Joins two islands in the pose that suits all of several candidates best.
+    fn join_by_all(&mut self, members: &[usize]) -> bool {
+        let first = &self.edges[members[0]];
+        let (ia, ib) = (self.state.island[first.a], self.state.island[first.b]);
+        let (mut here, mut there) = (Vec::new(), Vec::new());
+        for &k in members {
+            let e = &self.edges[k];
+            let centre = self.outlines[e.a].tabs[e.tab].origin;
+            for (dx, dy) in [(0.3, 0.0), (-0.3, 0.0), (0.0, 0.3), (0.0, -0.3)] {
+                let p = centre + Vector2::new(dx, dy) * self.scale;
+                let (in_a, in_b) = (self.state.pose[e.a] * p, self.state.pose[e.b] * (e.b_from_a * p));
+                let forward = self.state.island[e.a] == ia;
+                here.push(if forward { in_a } else { in_b });
+                there.push(if forward { in_b } else { in_a });
+            }
+        }
+        let pose = placement::rigid_fit(&here, &there);
+        if !self.merge(ia, ib, &pose) {
+            return false;
+        }
+        self.take(members[0]);
+        true
+    }
+
+    /// Where a piece's centroid lies in its island.
+    fn centre_of(&self, piece: usize) -> Point2<f64> {
+        self.state.pose[piece] * self.outlines[piece].centroid
+    }
+
     fn take(&mut self, k: usize) {
         for s in self.edges[k].slots() {
             self.state.used.insert(s, k);
@@ -633,7 +666,8 @@ impl Assembler<'_> {
                 if self.same_island(members[0]) || (members.len() > 1 && members.iter().any(|k| !self.free(*k))) {
                     continue;
                 }
-                if self.join(members[0]) {
+                let ok = if members.len() > 1 { self.join_by_all(&members) } else { self.join(members[0]) };
+                if ok {
                     joined += 1;
                     for k in &members[1..] {
                         if self.admissible(*k) {
@@ -683,6 +717,10 @@ impl Assembler<'_> {
                         &(poses[i] * self.state.pose[piece]),
                         &(poses[j] * self.state.pose[piece]),
                     );
+                    // The turn of one joint swings what is far from it.
+                    let own = &self.edges[*k];
+                    let here = if self.state.island[own.a] == low { own.a } else { own.b };
+                    let far = (self.centre_of(here) - self.centre_of(piece)).norm() / self.scale;
                     let slots = e.slots();
                     let distinct = group.iter().all(|g| {
                         self.edges[*g]
@@ -690,7 +728,7 @@ impl Assembler<'_> {
                             .iter()
                             .all(|s| slots.iter().all(|t| !conflict(self.outlines[s.piece], *s, *t)))
                     });
-                    if j != i && distinct && d < self.agree.position && turn < self.agree.angle {
+                    if j != i && distinct && d < AGREE.position + SWING * far && turn < AGREE.angle {
                         group.push(*other);
                     }
                 }
@@ -706,11 +744,8 @@ impl Assembler<'_> {
     fn evidence(&self, group: &[usize]) -> Option<f64> {
         let mut sum = AGREEMENT * (group.len() - 1) as f64;
         for &k in group {
-            let own = self.model.evidence(self.edges[k].cost);
-            if own < IMPLAUSIBLE {
-                return None;
-            }
-            sum += own;
+            // A worn joint among agreeing ones doesn't refute them.
+            sum += self.model.evidence(self.edges[k].cost).max(WORN);
         }
         if group.len() == 1 {
             sum = sum.min(self.lead(group[0]));
