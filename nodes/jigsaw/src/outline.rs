@@ -4,6 +4,7 @@
 //! Coordinates are pixels of the piece's image (x right, y down) unless said otherwise.
 
 use crate::Piece;
+use crate::frame::convex_hull;
 use isthmus::Point;
 use isthmus::isthmus::{Isthmus, Polarity};
 use nalgebra::{Isometry2, Matrix3, Matrix4, Vector2, Vector3, Vector4};
@@ -92,6 +93,8 @@ pub(crate) struct Outline {
     pub(crate) tabs: Vec<Segment>,
     pub(crate) mouths: Vec<Segment>,
     pub(crate) straights: Vec<Straight>,
+    /// Convex hull.
+    pub(crate) hull: Vec<Point>,
     pub(crate) raster: Raster,
 }
 
@@ -122,6 +125,7 @@ impl Outline {
         let radius = points.iter().map(|p| (p - centroid).norm()).fold(0.0, f64::max);
         let mut outline = Self {
             raster: Raster::new(&points, &normals, area.sqrt() / RASTER_CELLS),
+            hull: convex_hull(points.clone()),
             points,
             normals,
             spacing,

@@ -33,6 +33,10 @@ const TIGHT: Tolerance = Tolerance { position: 0.003, angle: 0.003 };
 const AGREE: Tolerance = Tolerance { position: 0.05, angle: 0.08 };
 /// The same when calibrated, at least.
 const MIN_AGREE: Tolerance = Tolerance { position: 0.015, angle: 0.02 };
+/// Steps along the border in an adjustment, in piece scales: while growing, and at the end, where 200 points around a
+/// piece leave a tenth of the noise of one.
+const COARSE: f64 = 0.05;
+const FINE: f64 = 0.02;
 /// Adjustments at the end: two bring the poses to a tenth of what the border's noise leaves.
 const FINAL_ROUNDS: usize = 2;
 /// Candidates of each mouth (and tab) that take part in loops: more and chance loops drown the true ones.
@@ -228,11 +232,11 @@ impl Assembler<'_> {
         self.islands(&found);
         let trusted: Vec<usize> = self.state.joined.clone();
         self.learn(&trusted);
-        self.refine_all(1);
+        self.refine_all(1, COARSE);
         self.grow();
         self.verify();
         self.improve();
-        self.refine_all(FINAL_ROUNDS);
+        self.refine_all(FINAL_ROUNDS, FINE);
         self.finish(joints)
     }
 
@@ -529,7 +533,7 @@ impl Assembler<'_> {
             && size >= 3 * self.state.refined[to].max(2) / 2
         {
             self.state.refined[to] = size;
-            self.adjust(to);
+            self.adjust(to, COARSE);
         }
         true
     }
@@ -589,7 +593,7 @@ impl Assembler<'_> {
     }
 
     /// Adjusts all poses of an island to all contacts of its outlines.
-    fn adjust(&mut self, island: usize) {
+    fn adjust(&mut self, island: usize, step: f64) {
         let members = self.state.members[island].clone();
         if members.len() < 2 {
             return;
@@ -605,7 +609,7 @@ impl Assembler<'_> {
         let factors: Vec<Factor> = pairs
             .par_iter()
             .filter_map(|&(p, q)| {
-                let c = self.contact_of(p, q, &(self.state.pose[q].inverse() * self.state.pose[p]))?;
+                let c = self.contact_of(p, q, &(self.state.pose[q].inverse() * self.state.pose[p]), step)?;
                 let pose = self.state.pose[q];
                 let r = pose.rotation.to_rotation_matrix();
                 let mut turn = Matrix3::identity();
@@ -631,21 +635,20 @@ impl Assembler<'_> {
         }
     }
 
-    fn contact_of(&self, p: usize, q: usize, q_from_p: &Isometry2<f64>) -> Option<Contact> {
+    fn contact_of(&self, p: usize, q: usize, q_from_p: &Isometry2<f64>, step: f64) -> Option<Contact> {
         let (a, b) = (self.outlines[p], self.outlines[q]);
-        // About 200 points around a piece: more adds nothing to an adjustment.
-        let stride = ((a.scale / 50.0 / a.spacing) as usize).max(1);
+        let stride = ((a.scale * step / a.spacing) as usize).max(1);
         contact(a, b, q_from_p, CONTACT_BAND * self.scale, stride, &self.prior)
     }
 
-    fn refine_all(&mut self, rounds: usize) {
+    fn refine_all(&mut self, rounds: usize, step: f64) {
         if !self.params.pose_graph {
             return;
         }
         for island in 0..self.state.members.len() {
             if self.state.members[island].len() > 1 {
                 for _ in 0..rounds {
-                    self.adjust(island);
+                    self.adjust(island, step);
                 }
             }
         }
@@ -679,7 +682,7 @@ impl Assembler<'_> {
             if joined == 0 {
                 return;
             }
-            self.refine_all(1);
+            self.refine_all(1, COARSE);
         }
     }
 
@@ -799,7 +802,7 @@ impl Assembler<'_> {
                 return;
             }
             self.detach(&evict, &broken);
-            self.refine_all(1);
+            self.refine_all(1, COARSE);
         }
     }
 
@@ -908,7 +911,13 @@ impl Assembler<'_> {
         let n = self.outlines.len();
         let mut matings = Vec::new();
         let mut taken: HashMap<Slot, usize> = HashMap::new();
-        let mut order: Vec<usize> = (0..self.edges.len()).filter(|k| self.same_island(*k) && self.agrees(*k)).collect();
+        let paper = self.params.policy == Policy::Paper;
+        // Unrefined poses contradict each other too much to recognise contacts that weren't decided on.
+        let mut order: Vec<usize> = if paper {
+            self.state.joined.clone()
+        } else {
+            (0..self.edges.len()).filter(|k| self.same_island(*k) && self.agrees(*k)).collect()
+        };
         order.sort_by(|p, q| joints[*p].fit.residual.total_cmp(&joints[*q].fit.residual).then(p.cmp(q)));
         // Contacts that agree with a piece's pose: each beyond the first confirms it.
         let mut evidence = vec![0.0f64; n];
@@ -917,7 +926,7 @@ impl Assembler<'_> {
             let slots = self.edges[k].slots();
             let own = self.model.evidence(self.edges[k].cost);
             let loops = self.edges[k].support.min(2) as f64 * AGREEMENT;
-            if slots.iter().any(|s| taken.contains_key(s)) || own + loops < IMPLAUSIBLE {
+            if slots.iter().any(|s| taken.contains_key(s)) || (!paper && own + loops < IMPLAUSIBLE) {
                 continue;
             }
             for s in slots {

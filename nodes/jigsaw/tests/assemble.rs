@@ -79,6 +79,18 @@ fn the_literal_rules_thin_out_the_table_step_by_step() {
     assert!(t.pairs > t.after_overlap && t.after_overlap >= 7, "{t:?}");
 }
 
+/// The greedy descent of the paper takes a wrong pair early, after which pieces can't be joined up.
+#[test]
+fn backtracking_mends_what_the_greedy_descent_spoils() {
+    let options = Options { rows: 3, columns: 3, clearance: [0.2, 0.2], seed: 1, ..Options::default() };
+    let paper = |backtracks| Params { policy: Policy::Paper, backtracks, ..Params::default() };
+    let (greedy, _) = solve(&options, &paper(0));
+    assert!(greedy.misplaced > 0 && !greedy.is_perfect(), "{greedy:?}");
+    let (mended, assembly) = solve(&options, &paper(1000));
+    assert!(mended.is_perfect(), "{mended:?}");
+    assert!(assembly.table.backtracks > 0 && assembly.unplaced.is_empty(), "{:?}", assembly.table);
+}
+
 #[test]
 fn order_of_insertion_and_threads_do_not_matter() {
     let puzzle = Puzzle::generate(&Options { seed: 21, ..Options::default() }).expect("valid options");
