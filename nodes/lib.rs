@@ -6,6 +6,7 @@
 
 pub mod bag;
 pub mod capture;
+pub mod cell;
 pub mod feature;
 pub mod ros;
 pub mod solver;

@@ -101,22 +101,32 @@ impl Drop for Process {
 /// A listener of its own.
 struct Listener {
     node: Node,
+    namespace: String,
 }
 
 impl Listener {
     fn new(domain: u16) -> Self {
+        Self::in_namespace(domain, "")
+    }
+
+    /// Relative names are those of this namespace.
+    fn in_namespace(domain: u16, namespace: &str) -> Self {
         let participant = rustdds::DomainParticipantBuilder::new(domain)
             .with_only_networks([std::net::IpAddr::from([127, 0, 0, 1])])
             .build()
             .unwrap();
         let context = Context::from_domain_participant(participant).unwrap();
         let node = context.new_node(NodeName::new("/", "listener").unwrap(), NodeOptions::new()).unwrap();
-        Self { node }
+        Self { node, namespace: namespace.to_owned() }
     }
 
     /// The first message on a topic for which the condition holds.
     fn wait<M: jigsaw_msgs::Message>(&mut self, topic: &Topic<M>, wanted: impl Fn(&M) -> bool) -> M {
-        let name = if topic.name.starts_with('/') { topic.name.to_owned() } else { format!("/{}", topic.name) };
+        let name = if topic.name.starts_with('/') {
+            topic.name.to_owned()
+        } else {
+            format!("{}/{}", self.namespace, topic.name)
+        };
         let type_name = MessageTypeName::new(M::TYPE.package, M::TYPE.name);
         let dds_topic = self.node.create_topic(&Name::parse(&name).unwrap(), type_name, &topic.qos).unwrap();
         let subscription = self.node.create_subscription::<M>(&dds_topic, None).unwrap();

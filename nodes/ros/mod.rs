@@ -2,6 +2,7 @@
 //!
 //! | module | what stands there, and nowhere else |
 //! | --- | --- |
+//! | [`actions`] | goals as a stream |
 //! | [`args`] | the command line of ROS: remapping, parameters, names |
 //! | [`params`] | declaration, check and documentation of parameters |
 //! | [`services`] | the six parameter services |
@@ -13,6 +14,7 @@
 //! | [`health`] | counters of a node, published as `/diagnostics` |
 //! | [`transforms`] | pixels (y down) to metres (y up) |
 
+pub mod actions;
 pub mod args;
 pub mod health;
 pub mod logging;

@@ -135,11 +135,7 @@ pub fn main(program: Program, open: impl FnOnce(Session) -> Result<Work, Process
         return ExitCode::SUCCESS;
     }
     let result = Process::start(program.name, args).and_then(|process| {
-        if let Some(unknown) = process.args.rest.first() {
-            return Err(ProcessError::Configuration(format!(
-                "unknown argument '{unknown}': ROS arguments stand behind --ros-args (see --help)"
-            )));
-        }
+        process.only_ros_arguments()?;
         process.run(|process| open(process.node(program.name, program.parameters)?))
     });
     exit_code(program.name, result)
@@ -185,6 +181,8 @@ pub struct Process {
     executor: Rc<smol::LocalExecutor<'static>>,
     endpoints: Endpoints,
     participant: Option<(DomainParticipant, Context)>,
+    /// The parameters of all nodes of a composed process: one that another node has is no mistake.
+    tables: &'static [&'static [Spec]],
 }
 
 impl Process {
@@ -204,7 +202,27 @@ impl Process {
             executor: Rc::new(smol::LocalExecutor::new()),
             endpoints: Endpoints::default(),
             participant: None,
+            tables: &[],
         })
+    }
+
+    /// Says that several nodes will be opened, with these parameters among them: one that any of them has is then
+    /// passed over by the others.
+    pub fn composed_of(self, tables: &'static [&'static [Spec]]) -> Self {
+        Self { tables, ..self }
+    }
+
+    /// Checks that nothing but ROS arguments was given.
+    ///
+    /// # Errors
+    /// The first other argument.
+    pub fn only_ros_arguments(&self) -> Result<(), ProcessError> {
+        match self.args.rest.first() {
+            None => Ok(()),
+            Some(unknown) => Err(ProcessError::Configuration(format!(
+                "unknown argument '{unknown}': ROS arguments stand behind --ros-args (see --help)"
+            ))),
+        }
     }
 
     /// Opens a node with its parameters, their services, its clock and its report.
@@ -214,7 +232,11 @@ impl Process {
     pub fn node(&mut self, name: &str, parameters: &'static [Spec]) -> Result<Session, ProcessError> {
         let names = self.args.node("/", name)?;
         let table = Arc::new(Parameters::declare(&names.full_name(), &[parameters, COMMON_PARAMETERS]));
-        table.start_with(&self.args.overrides(&names))?;
+        let mut overrides = self.args.overrides(&names);
+        for given in &mut overrides {
+            given.addressed &= !self.tables.iter().flat_map(|table| table.iter()).any(|spec| spec.name == given.name);
+        }
+        table.start_with(&overrides)?;
         let context = self.context(&table)?;
         let node_name = NodeName::new(names.namespace(), names.name())
             .map_err(|e| SessionError::middleware(format!("node {}", names.full_name()), e))?;

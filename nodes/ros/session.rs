@@ -60,7 +60,7 @@ pub struct Call<S: Service> {
 /// Gives a message of a service the client library's marker trait; same bytes.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 #[serde(transparent, bound = "")]
-struct Wire<T: Message>(T);
+pub(super) struct Wire<T: Message>(pub(super) T);
 
 impl<T: Message> ros2_client::Message for Wire<T> {}
 

@@ -92,5 +92,14 @@ pub const RESET_SERVICE: &str = "reset";
 /// Service of the solver node: solve now.
 pub const SOLVE_SERVICE: &str = "solve";
 
+/// Action of the solver node: assemble until the puzzle is complete or the time is up.
+pub const ASSEMBLE_ACTION: &str = "assemble";
+
 /// Quality of service of both ends of all services.
 pub const SERVICE_QOS: QosProfile = RELIABLE.history(History::KeepLast { depth: 10 });
+
+/// Quality of service of the feedback of actions.
+pub const FEEDBACK_QOS: QosProfile = RELIABLE.history(History::KeepLast { depth: 10 });
+
+/// Quality of service of the status of actions.
+pub const STATUS_QOS: QosProfile = LATCHED;

@@ -2,6 +2,7 @@
 
 use std::collections::HashSet;
 use std::hash::{DefaultHasher, Hash, Hasher};
+use std::time::Duration;
 
 use isthmus::contour::Border;
 use isthmus::isthmus::{Isthmus, Polarity};
@@ -81,6 +82,27 @@ impl FeaturesError {
     }
 }
 
+/// The goal of the action `assemble`; its fields are those of `jigsaw_msgs/action/Assemble_Goal` in their order.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, serde::Serialize, serde::Deserialize)]
+pub struct AssembleGoal {
+    /// Pieces of the whole puzzle; 0 for as many as come.
+    pub expected_pieces: u32,
+    /// Seconds of the time budget; 0 (with no nanoseconds) for no limit.
+    pub budget_sec: i32,
+    /// Nanoseconds of the time budget.
+    pub budget_nanosec: u32,
+}
+
+impl ros2_client::Message for AssembleGoal {}
+
+impl AssembleGoal {
+    /// The time there is, if it is limited.
+    pub fn budget(&self) -> Option<Duration> {
+        let budget = Duration::new(u64::try_from(self.budget_sec).unwrap_or_default(), self.budget_nanosec);
+        (!budget.is_zero()).then_some(budget)
+    }
+}
+
 /// Where a piece was seen.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Sighting {
@@ -94,6 +116,26 @@ pub struct Sighting {
     pub centroid_in_image: Point,
     /// Its border in the frame.
     pub border_in_image: Vec<Point>,
+}
+
+/// Distance in pixels up to which two borders in the same frame are those of one piece that has not moved: more than the
+/// noise of a border and the shake of a camera, far less than any two pieces differ that come to lie alike.
+const SAME_PLACE_PX: f64 = 1.5;
+
+/// Of how many border points one is compared.
+const SAME_PLACE_STRIDE: usize = 16;
+
+impl Sighting {
+    /// Whether this is the same piece in the same place, seen by the same camera: a capture node that was started
+    /// again gives what still lies there new names.
+    pub fn is_same_place(&self, other: &Self) -> bool {
+        let distance =
+            |p: &Point| other.border_in_image.iter().map(|q| (q - p).norm_squared()).fold(f64::MAX, f64::min);
+        self.source == other.source
+            && self.table == other.table
+            && (self.centroid_in_image - other.centroid_in_image).norm() <= SAME_PLACE_PX
+            && self.border_in_image.iter().step_by(SAME_PLACE_STRIDE).all(|p| distance(p) <= SAME_PLACE_PX.powi(2))
+    }
 }
 
 /// The piece and the sighting that a message carries.

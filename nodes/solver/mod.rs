@@ -10,15 +10,17 @@ use std::collections::HashMap;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use futures::channel::mpsc;
+use futures::channel::{mpsc, oneshot};
 use futures::future::{Fuse, FusedFuture};
 use futures::{FutureExt, SinkExt, Stream, StreamExt, pin_mut};
 use jigsaw::{Assembly, Params, Piece, Solver, SolverError};
+use jigsaw_msgs::action::{Assemble, AssembleFeedback, AssembleResult};
 use jigsaw_msgs::msg::{Assembly as AssemblyMessage, PieceFeatures};
 use jigsaw_msgs::std_srvs::srv::{Trigger, TriggerResponse};
 use jigsaw_msgs::tf2_msgs::msg::TFMessage;
 use jigsaw_msgs::visualization_msgs::msg::MarkerArray;
 
+use crate::ros::actions::{Goal, GoalEnd};
 use crate::ros::health::Health;
 use crate::ros::params::Parameters;
 use crate::ros::process::{ProcessError, Program, Work};
@@ -33,9 +35,13 @@ pub const PROGRAM: Program = Program {
             Topic in:   pieces/features (jigsaw_msgs/PieceFeatures)\n\
             Topics out: assembly (jigsaw_msgs/Assembly), /tf_static, assembly/image (sensor_msgs/Image),\n            \
             assembly/markers (visualization_msgs/MarkerArray)\n\
-            Services:   reset (std_srvs/Trigger): forget all pieces; solve (std_srvs/Trigger): solve now",
+            Services:   reset (std_srvs/Trigger): forget all pieces; solve (std_srvs/Trigger): solve now\n\
+            Action:     assemble (jigsaw_msgs/action/Assemble)",
     parameters: params::PARAMETERS,
 };
+
+/// A goal of the action `assemble`.
+pub type AssembleGoal = Goal<convert::AssembleGoal, Assemble>;
 
 /// Where the results go.
 #[derive(Debug, Clone)]
@@ -58,6 +64,7 @@ pub fn open(
 ) -> Result<Work, ProcessError> {
     let resets = session.serve::<Trigger>(topics::RESET_SERVICE)?;
     let solves = session.serve::<Trigger>(topics::SOLVE_SERVICE)?;
+    let goals = session.act::<Assemble, convert::AssembleGoal>(topics::ASSEMBLE_ACTION)?;
     let outputs = Outputs {
         assembly: session.publish(&topics::ASSEMBLY)?.0,
         transforms: session.publish(&topics::TF_STATIC)?.0,
@@ -65,42 +72,61 @@ pub fn open(
     };
     let (parameters, health) = (Arc::clone(&session.parameters), Arc::clone(&session.health));
     Ok(Box::pin(async move {
-        run(features, resets, solves, outputs, parameters, health).await;
+        run(features, Requests { resets, solves, goals }, outputs, parameters, health).await;
         drop(session);
         Ok(())
     }))
 }
 
-/// The node's loop. Ends, after a last solution, when shapes and calls have ended.
+/// What others may ask for.
+#[derive(Debug)]
+pub struct Requests<R, S, G> {
+    /// Calls of `reset`.
+    pub resets: R,
+    /// Calls of `solve`.
+    pub solves: S,
+    /// Goals of `assemble`, one at a time.
+    pub goals: G,
+}
+
+/// The node's loop. Ends, after a last solution, when shapes and requests have ended.
 pub async fn run(
     features: impl Stream<Item = PieceFeatures> + Unpin,
-    resets: impl Stream<Item = Call<Trigger>> + Unpin,
-    solves: impl Stream<Item = Call<Trigger>> + Unpin,
+    requests: Requests<
+        impl Stream<Item = Call<Trigger>> + Unpin,
+        impl Stream<Item = Call<Trigger>> + Unpin,
+        impl Stream<Item = AssembleGoal> + Unpin,
+    >,
     outputs: Outputs,
     parameters: Arc<Parameters>,
     health: Arc<Health>,
 ) {
     let mut changes = parameters.changes();
     let mut table = Table::new(outputs, parameters, health);
-    let (mut features, mut resets, mut solves) = (features.fuse(), resets.fuse(), solves.fuse());
+    let mut features = features.fuse();
+    let (mut resets, mut solves, mut goals) = (requests.resets.fuse(), requests.solves.fuse(), requests.goals.fuse());
     let solving = Fuse::terminated();
-    pin_mut!(solving);
+    let cancelled = Fuse::terminated();
+    pin_mut!(solving, cancelled);
     loop {
         let idle = solving.is_terminated();
-        if idle && features.is_done() && resets.is_done() && solves.is_done() && table.due.is_none() {
+        let ended = features.is_done() && resets.is_done() && solves.is_done() && goals.is_done();
+        if idle && ended && table.due.is_none() {
             break;
         }
-        let wait = table.due.filter(|_| idle).map(|due| due.saturating_duration_since(Instant::now()));
-        if wait.is_some_and(|wait| wait.is_zero()) {
+        let now = Instant::now();
+        table.end_overdue_goal(now);
+        if idle && table.due.is_some_and(|due| due <= now) {
             solving.set(smol::unblock(table.work()).fuse());
             continue;
         }
-        let mut settled = FutureExt::fuse(wait.map_or_else(smol::Timer::never, smol::Timer::after));
+        let next = table.due.filter(|_| idle).into_iter().chain(table.deadline()).min();
+        let mut alarm = FutureExt::fuse(next.map_or_else(smol::Timer::never, smol::Timer::at));
         futures::select! {
             message = features.next() => if let Some(message) = message {
                 table.take(&message);
             },
-            _ = settled => {}
+            _ = alarm => {}
             done = solving => table.publish(done).await,
             call = resets.next() => if let Some(call) = call {
                 table.reset();
@@ -110,6 +136,12 @@ pub async fn run(
             call = solves.next() => if let Some(call) = call {
                 table.waiting.push(call);
                 table.due = Some(Instant::now());
+            },
+            goal = goals.next() => if let Some(goal) = goal {
+                cancelled.set(table.pursue(goal).fuse());
+            },
+            called_off = cancelled => if called_off.is_ok() {
+                table.end_goal(GoalEnd::Cancelled);
             },
             change = changes.next() => if change.is_some() && !table.sightings.is_empty() {
                 table.due = Some(Instant::now());
@@ -163,6 +195,18 @@ struct Table {
     generation: u64,
     /// The transforms published last.
     transforms: TFMessage,
+    /// The assembly published last.
+    best: AssemblyMessage,
+    /// The goal that is pursued, if any.
+    goal: Option<Pursuit>,
+}
+
+/// A goal of `assemble` while it is pursued.
+struct Pursuit {
+    expected_pieces: usize,
+    deadline: Option<Instant>,
+    feedback: mpsc::Sender<AssembleFeedback>,
+    finish: oneshot::Sender<(GoalEnd, AssembleResult)>,
 }
 
 impl Table {
@@ -178,6 +222,40 @@ impl Table {
             waiting: Vec::new(),
             generation: 0,
             transforms: TFMessage::default(),
+            best: AssemblyMessage::default(),
+            goal: None,
+        }
+    }
+
+    /// Begins to pursue a goal; resolves when its client calls it off.
+    fn pursue(&mut self, goal: AssembleGoal) -> oneshot::Receiver<()> {
+        let now = Instant::now();
+        self.goal = Some(Pursuit {
+            expected_pieces: usize::try_from(goal.goal.expected_pieces).unwrap_or(usize::MAX),
+            deadline: goal.goal.budget().and_then(|budget| now.checked_add(budget)),
+            feedback: goal.feedback,
+            finish: goal.finish,
+        });
+        // A solution under the goal's own number of pieces, and the first feedback with it.
+        self.due = Some(now);
+        goal.cancelled
+    }
+
+    fn deadline(&self) -> Option<Instant> {
+        self.goal.as_ref().and_then(|goal| goal.deadline)
+    }
+
+    fn end_overdue_goal(&mut self, now: Instant) {
+        if self.deadline().is_some_and(|deadline| deadline <= now) {
+            self.end_goal(GoalEnd::Aborted);
+        }
+    }
+
+    fn end_goal(&mut self, end: GoalEnd) {
+        if let Some(goal) = self.goal.take() {
+            let result = AssembleResult { complete: end == GoalEnd::Succeeded, assembly: self.best.clone() };
+            // The client may have gone; that is no concern of the node.
+            let _ = goal.finish.send((end, result));
         }
     }
 
@@ -195,7 +273,8 @@ impl Table {
         }
     }
 
-    /// Whether the piece is new; the same message again (of a latched topic, or a node that was restarted) is not.
+    /// Whether the piece is new. The same message again (of a latched topic, or of a node that was started again) is not,
+    /// nor is a piece that still lies where it was seen before.
     fn admit(&mut self, message: &PieceFeatures) -> Result<bool, FeaturesError> {
         let (piece, sighting) = convert::piece(message)?;
         let scale = self.sightings.values().next().map(|(_, other)| other.table.metres_per_pixel);
@@ -203,6 +282,10 @@ impl Table {
         let fingerprint = convert::fingerprint(message);
         if let Some((known, _)) = self.sightings.get(&piece.id) {
             return if *known == fingerprint { Ok(false) } else { Err(FeaturesError::DuplicateId(piece.id)) };
+        }
+        if let Some((known, _)) = self.sightings.iter().find(|(_, (_, other))| sighting.is_same_place(other)) {
+            log::info!("piece {} is piece {known}, which still lies there", piece.id);
+            return Ok(false);
         }
         let most = params::count(&self.parameters, &params::MAXIMUM_PIECES);
         if self.sightings.len() >= most {
@@ -275,7 +358,10 @@ impl Table {
         Naming {
             table_frame: self.parameters.text(&params::TABLE_FRAME),
             puzzle_frame: self.parameters.text(&params::PUZZLE_FRAME),
-            expected_pieces: params::count(&self.parameters, &params::EXPECTED_PIECES),
+            expected_pieces: match &self.goal {
+                Some(goal) if goal.expected_pieces > 0 => goal.expected_pieces,
+                _ => params::count(&self.parameters, &params::EXPECTED_PIECES),
+            },
         }
     }
 
@@ -298,6 +384,19 @@ impl Table {
         if transforms != self.transforms {
             self.transforms = transforms.clone();
             let _ = self.outputs.transforms.send(transforms).await;
+        }
+        self.best = message.clone();
+        if let Some(goal) = &mut self.goal {
+            let feedback = AssembleFeedback {
+                pieces_seen: u32::try_from(seen).unwrap_or(u32::MAX),
+                matings: u32::try_from(message.matings.len()).unwrap_or(u32::MAX),
+                best: message.clone(),
+            };
+            // A client that is behind gets the next one.
+            let _ = goal.feedback.try_send(feedback);
+        }
+        if message.state == AssemblyMessage::COMPLETE {
+            self.end_goal(GoalEnd::Succeeded);
         }
         // A closed output is that of a process that ends.
         let _ = self.outputs.assembly.send(message).await;

@@ -1,0 +1,371 @@
+//! The loops of the three nodes over vectors, without any middleware: frames in, poses out, against the truth.
+
+use std::sync::Arc;
+
+use futures::channel::{mpsc, oneshot};
+use futures::{StreamExt, stream};
+use image::ExtendedColorType;
+use jigsaw::generate::{Options, Puzzle};
+use jigsaw_msgs::action::{AssembleFeedback, AssembleResult};
+use jigsaw_msgs::builtin_interfaces::msg::Time;
+use jigsaw_msgs::geometry_msgs::msg::Pose;
+use jigsaw_msgs::msg::{Assembly, PieceFeatures, PieceImage};
+use jigsaw_msgs::sensor_msgs::msg::{CompressedImage, Image};
+use jigsaw_msgs::std_msgs::msg::Header;
+use jigsaw_msgs::std_srvs::srv::{Trigger, TriggerRequest, TriggerResponse};
+use jigsaw_msgs::tf2_msgs::msg::TFMessage;
+use jigsaw_msgs::visualization_msgs::msg::{Marker, MarkerArray};
+use jigsaw_nodes::capture::source::Frame;
+use jigsaw_nodes::ros::actions::{Goal, GoalEnd};
+use jigsaw_nodes::ros::health::Health;
+use jigsaw_nodes::ros::params::{Parameters, Spec};
+use jigsaw_nodes::ros::session::Call;
+use jigsaw_nodes::ros::transforms::PixelPlane;
+use jigsaw_nodes::{capture, feature, solver};
+use nalgebra::{Isometry2, Vector2};
+
+/// Tolerance of a goal pose, in pixels and radians: a few times what the refinement reaches on such frames.
+const TOLERANCE_PX: f64 = 0.5;
+const TOLERANCE_RAD: f64 = 0.005;
+
+const TOPIC: &str = "/camera/image";
+
+fn parameters(table: &'static [Spec]) -> Arc<Parameters> {
+    Arc::new(Parameters::declare("/test", &[table]))
+}
+
+fn health() -> Arc<Health> {
+    Arc::new(Health::new("/test"))
+}
+
+fn puzzle() -> Puzzle {
+    Puzzle::generate(&Options { rows: 2, columns: 3, seed: 11, noise: 2.0, blur: 1.0, ..Options::default() }).unwrap()
+}
+
+fn header(sec: i32) -> Header {
+    Header { stamp: Time { sec, nanosec: 0 }, frame_id: "camera".to_owned() }
+}
+
+fn raw_frames(puzzle: &Puzzle) -> Vec<Frame> {
+    (0..puzzle.frame_count())
+        .map(|k| {
+            let frame = puzzle.render(k);
+            let image = Image {
+                header: header(k as i32),
+                height: frame.height,
+                width: frame.width,
+                encoding: "mono8".to_owned(),
+                is_bigendian: 0,
+                step: frame.width,
+                data: frame.pixels,
+            };
+            Frame::Raw(TOPIC.to_owned(), image)
+        })
+        .collect()
+}
+
+fn run_capture(frames: Vec<Frame>, calls: Vec<Call<Trigger>>, health: &Arc<Health>) -> Vec<PieceImage> {
+    let (sender, receiver) = mpsc::unbounded();
+    let settings =
+        capture::Settings { parameters: parameters(capture::params::PARAMETERS), health: Arc::clone(health) };
+    smol::block_on(capture::run(stream::iter(frames), stream::iter(calls), sender, settings));
+    smol::block_on(receiver.collect())
+}
+
+fn run_feature(pieces: Vec<PieceImage>, health: &Arc<Health>) -> Vec<PieceFeatures> {
+    let (sender, receiver) = mpsc::unbounded();
+    let parameters = parameters(feature::params::PARAMETERS);
+    smol::block_on(feature::run(stream::iter(pieces), sender, parameters, Arc::clone(health)));
+    smol::block_on(receiver.collect())
+}
+
+struct Published {
+    assemblies: Vec<Assembly>,
+    transforms: Vec<TFMessage>,
+    markers: Vec<MarkerArray>,
+}
+
+fn run_solver(features: Vec<PieceFeatures>, resets: Vec<Call<Trigger>>, health: &Arc<Health>) -> Published {
+    run_solver_with_goals(features, resets, Vec::new(), health)
+}
+
+fn run_solver_with_goals(
+    features: Vec<PieceFeatures>,
+    resets: Vec<Call<Trigger>>,
+    goals: Vec<solver::AssembleGoal>,
+    health: &Arc<Health>,
+) -> Published {
+    // Room for everything the loop may publish, so that nobody need read while it runs.
+    let room = 2 * features.len() + 16;
+    let (assembly, assemblies) = mpsc::channel(room);
+    let (transform, transforms) = mpsc::channel(room);
+    let (marker, markers) = mpsc::channel(room);
+    let outputs = solver::Outputs { assembly, transforms: transform, markers: marker };
+    let parameters = parameters(solver::params::PARAMETERS);
+    let requests =
+        solver::Requests { resets: stream::iter(resets), solves: stream::empty(), goals: stream::iter(goals) };
+    smol::block_on(async {
+        solver::run(stream::iter(features), requests, outputs, parameters, Arc::clone(health)).await;
+        Published {
+            assemblies: assemblies.collect().await,
+            transforms: transforms.collect().await,
+            markers: markers.collect().await,
+        }
+    })
+}
+
+fn call() -> (Call<Trigger>, oneshot::Receiver<TriggerResponse>) {
+    let (reply, answer) = oneshot::channel();
+    (Call { request: TriggerRequest::default(), reply }, answer)
+}
+
+fn plane_pose(pose: &Pose) -> Isometry2<f64> {
+    let angle = 2.0 * pose.orientation.z.atan2(pose.orientation.w);
+    Isometry2::new(Vector2::new(pose.position.x, pose.position.y), angle)
+}
+
+#[test]
+fn frames_become_poses_that_agree_with_the_truth() {
+    let puzzle = puzzle();
+    let health = health();
+    let pieces = run_capture(raw_frames(&puzzle), Vec::new(), &health);
+    assert_eq!(pieces.len(), 6);
+    let features = run_feature(pieces, &health);
+    let published = run_solver(features.clone(), Vec::new(), &health);
+    assert_eq!(health.refusals(), 0);
+
+    let last = published.assemblies.last().unwrap();
+    assert_eq!((last.state, last.pieces.len(), last.unplaced.len()), (Assembly::COMPLETE, 6, 0));
+    assert_eq!(last.header.stamp.sec, 5);
+    let scale = features[0].metres_per_pixel;
+    // The frame of the solution is its own; the first piece ties it to the frame of the truth.
+    let mut solution_from_truth = None;
+    for (k, truth) in puzzle.pieces().iter().enumerate() {
+        let id = format!("{}_000000000", truth.frame);
+        let placed = last.pieces.iter().find(|p| p.id == id).unwrap();
+        let border = puzzle.border(k, 1.0);
+        let [width, height] = puzzle.options().frame_size();
+        let table = PixelPlane::table(width, height, scale);
+        let observed = table.metres_from_pixels(border.centroid());
+        let found = plane_pose(&placed.observed);
+        assert!((found.translation.vector - observed.coords).norm() < TOLERANCE_PX * scale);
+        assert_eq!(found.rotation.angle(), 0.0);
+        let truth_plane = PixelPlane { metres_per_pixel: scale, origin_px: nalgebra::Point2::origin() };
+        let goal = truth_plane.pose(&puzzle.puzzle_from_image(k).unwrap(), border.centroid());
+        let found = plane_pose(&placed.goal);
+        let tie = *solution_from_truth.get_or_insert(found * goal.inverse());
+        let error = found.inverse() * tie * goal;
+        assert!(error.translation.vector.norm() < TOLERANCE_PX * scale, "{id}: {error}");
+        assert!(error.rotation.angle().abs() < TOLERANCE_RAD, "{id}: {error}");
+    }
+
+    let transforms = published.transforms.last().unwrap();
+    assert_eq!(transforms.transforms.len(), 12);
+    let markers = &published.markers.last().unwrap().markers;
+    assert_eq!(markers[0].action, Marker::DELETEALL);
+    assert_eq!(markers.len(), 13);
+    let outlines = markers.iter().filter(|m| m.ns == "outline");
+    let points: Vec<_> = outlines.flat_map(|m| &m.points).collect();
+    let low = |value: fn(&jigsaw_msgs::geometry_msgs::msg::Point) -> f64| {
+        points.iter().map(|p| value(p)).fold(f64::MAX, f64::min)
+    };
+    // The origin of the puzzle frame is its bottom left corner.
+    assert!(low(|p| p.x).abs() < 1e-12 && low(|p| p.y).abs() < 1e-12);
+}
+
+#[test]
+fn the_same_run_twice_gives_the_same_messages() {
+    let puzzle = puzzle();
+    let run = || {
+        let health = health();
+        let features = run_feature(run_capture(raw_frames(&puzzle), Vec::new(), &health), &health);
+        run_solver(features, Vec::new(), &health).assemblies.last().cloned().unwrap()
+    };
+    assert_eq!(run(), run());
+}
+
+#[test]
+fn raw_and_compressed_frames_give_the_same_pieces() {
+    let puzzle = puzzle();
+    let compressed = (0..puzzle.frame_count())
+        .map(|k| {
+            let frame = puzzle.render(k);
+            let mut png = std::io::Cursor::new(Vec::new());
+            image::write_buffer_with_format(
+                &mut png,
+                &frame.pixels,
+                frame.width,
+                frame.height,
+                ExtendedColorType::L8,
+                image::ImageFormat::Png,
+            )
+            .unwrap();
+            let image = CompressedImage { header: header(k as i32), format: "png".into(), data: png.into_inner() };
+            Frame::Compressed(TOPIC.to_owned(), image)
+        })
+        .collect();
+    let health = health();
+    assert_eq!(run_capture(raw_frames(&puzzle), Vec::new(), &health), run_capture(compressed, Vec::new(), &health));
+}
+
+#[test]
+fn bad_frames_are_refused_and_the_rest_goes_on() {
+    let puzzle = puzzle();
+    let mut frames = raw_frames(&puzzle);
+    let ground =
+        Image { encoding: "mono8".into(), width: 64, height: 64, step: 64, data: vec![200; 4096], ..Image::default() };
+    let short = Image { data: vec![0; 10], ..ground.clone() };
+    let unknown = Image { encoding: "bayer".into(), ..ground.clone() };
+    for (at, bad) in [(0, ground), (2, short), (4, unknown)] {
+        frames.insert(at, Frame::Raw(TOPIC.to_owned(), bad));
+    }
+    frames.push(Frame::Compressed(
+        TOPIC.to_owned(),
+        CompressedImage { data: b"text".to_vec(), ..CompressedImage::default() },
+    ));
+    let health = health();
+    assert_eq!(run_capture(frames, Vec::new(), &health).len(), 6);
+    assert_eq!(health.refusals(), 4);
+}
+
+#[test]
+fn the_capture_service_publishes_the_latest_pieces_again() {
+    let (early, too_early) = call();
+    let health = health();
+    assert!(run_capture(Vec::new(), vec![early], &health).is_empty());
+    assert!(!smol::block_on(too_early).unwrap().success);
+}
+
+#[test]
+fn bad_features_are_refused_and_change_nothing() {
+    let puzzle = puzzle();
+    let health = health();
+    let good = run_feature(run_capture(raw_frames(&puzzle), Vec::new(), &health), &health);
+    let clean = run_solver(good.clone(), Vec::new(), &health).assemblies.last().cloned().unwrap();
+    let first = &good[0];
+    let other = |change: &dyn Fn(&mut PieceFeatures)| {
+        let mut bad = first.clone();
+        bad.id = "stranger".to_owned();
+        change(&mut bad);
+        bad
+    };
+    let bad = vec![
+        other(&|f| f.id = "a/b".to_owned()),
+        other(&|f| f.id = String::new()),
+        other(&|f| f.border_x_px[3] = f32::NAN),
+        other(&|f| f.border_y_px.truncate(4)),
+        other(&|f| f.border_x_px.iter_mut().for_each(|x| *x = -*x)),
+        other(&|f| f.border_length_px = f32::INFINITY),
+        other(&|f| f.metres_per_pixel = 0.0),
+        other(&|f| f.metres_per_pixel *= 2.0),
+        other(&|f| f.frame_width_px = u32::MAX),
+        other(&|f| f.noise_px = -1.0),
+        other(&|f| f.isthmuses[0].arc_px[0] = 1e9),
+        other(&|f| f.isthmuses[0].polarity = 7),
+        other(&|f| f.isthmuses[0].width_px = f32::NAN),
+        // A piece of another name's content under a known id.
+        PieceFeatures { id: first.id.clone(), ..good[1].clone() },
+    ];
+    let refused = bad.len() as u64;
+    let health = self::health();
+    let mut mixed = good.clone();
+    mixed.extend(bad);
+    // The same message again is no offence.
+    mixed.push(first.clone());
+    let published = run_solver(mixed, Vec::new(), &health);
+    assert_eq!(health.refusals(), refused);
+    assert_eq!(published.assemblies.last().unwrap(), &clean);
+}
+
+#[test]
+fn a_piece_that_still_lies_there_is_counted_once() {
+    let puzzle = puzzle();
+    let health = health();
+    let mut features = run_feature(run_capture(raw_frames(&puzzle), Vec::new(), &health), &health);
+    // As a capture node names them that was started again while the camera looks at the same table.
+    let again: Vec<PieceFeatures> = features
+        .iter()
+        .map(|f| {
+            let mut again = PieceFeatures { id: format!("again_{}", f.id), ..f.clone() };
+            again.border_x_px.iter_mut().enumerate().for_each(|(i, x)| *x += 0.2 * (i as f32).sin());
+            again
+        })
+        .collect();
+    features.extend(again);
+    let published = run_solver(features, Vec::new(), &health);
+    let last = published.assemblies.last().unwrap();
+    assert_eq!((last.state, last.pieces.len(), last.unplaced.len()), (Assembly::COMPLETE, 6, 0));
+}
+
+#[test]
+fn the_order_of_the_pieces_does_not_matter() {
+    let puzzle = puzzle();
+    let health = health();
+    let mut features = run_feature(run_capture(raw_frames(&puzzle), Vec::new(), &health), &health);
+    let relative = |assembly: &Assembly| {
+        let goal = |frame: usize| {
+            let id = format!("{frame}_000000000");
+            plane_pose(&assembly.pieces.iter().find(|p| p.id == id).unwrap().goal)
+        };
+        (1..6).map(|k| goal(0).inverse() * goal(k)).collect::<Vec<_>>()
+    };
+    let forward = run_solver(features.clone(), Vec::new(), &health);
+    features.reverse();
+    let backward = run_solver(features, Vec::new(), &health);
+    let poses = |p: &Published| relative(p.assemblies.last().unwrap());
+    for (a, b) in poses(&forward).iter().zip(poses(&backward)) {
+        let error = a.inverse() * b;
+        assert!(error.translation.vector.norm() < TOLERANCE_PX * 1e-4 && error.rotation.angle().abs() < TOLERANCE_RAD);
+    }
+}
+
+#[test]
+fn a_reset_forgets_all_pieces() {
+    let (reset, answer) = call();
+    let published = run_solver(Vec::new(), vec![reset], &health());
+    assert!(smol::block_on(answer).unwrap().success);
+    let last = published.assemblies.last().unwrap();
+    assert_eq!((last.state, last.pieces.len()), (Assembly::COLLECTING, 0));
+    assert_eq!(published.markers.last().unwrap().markers.len(), 1);
+}
+
+type End = (GoalEnd, AssembleResult);
+
+fn goal(expected_pieces: u32) -> (solver::AssembleGoal, mpsc::Receiver<AssembleFeedback>, oneshot::Receiver<End>) {
+    let (feedback, feedbacks) = mpsc::channel(100);
+    let (finish, finished) = oneshot::channel();
+    let (_, cancelled) = oneshot::channel();
+    let goal = solver::convert::AssembleGoal { expected_pieces, ..Default::default() };
+    (Goal { goal, feedback, finish, cancelled }, feedbacks, finished)
+}
+
+#[test]
+fn a_goal_succeeds_when_every_expected_piece_is_placed() {
+    let puzzle = puzzle();
+    let health = health();
+    let features = run_feature(run_capture(raw_frames(&puzzle), Vec::new(), &health), &health);
+    let (wish, feedbacks, finished) = goal(6);
+    run_solver_with_goals(features.clone(), Vec::new(), vec![wish], &health);
+    let (end, result) = smol::block_on(finished).unwrap();
+    assert_eq!((end, result.complete, result.assembly.pieces.len()), (GoalEnd::Succeeded, true, 6));
+    let feedbacks: Vec<_> = smol::block_on(feedbacks.collect());
+    assert_eq!(feedbacks.last().unwrap().pieces_seen, 6);
+
+    // A goal that waits for a piece that never comes is not reached.
+    let (wish, _, finished) = goal(7);
+    run_solver_with_goals(features, Vec::new(), vec![wish], &health);
+    assert!(smol::block_on(finished).is_err());
+}
+
+#[test]
+fn a_goal_has_the_bytes_of_its_message() {
+    let message = jigsaw_msgs::action::AssembleGoal {
+        expected_pieces: 24,
+        time_budget: jigsaw_msgs::builtin_interfaces::msg::Duration { sec: 3, nanosec: 5 },
+    };
+    let goal = solver::convert::AssembleGoal { expected_pieces: 24, budget_sec: 3, budget_nanosec: 5 };
+    let of_message = cdr_encoding::to_vec::<_, byteorder::LittleEndian>(&message).unwrap();
+    let of_goal = cdr_encoding::to_vec::<_, byteorder::LittleEndian>(&goal).unwrap();
+    assert_eq!(of_message, of_goal);
+    assert_eq!(goal.budget(), Some(std::time::Duration::new(3, 5)));
+}
