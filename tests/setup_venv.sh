@@ -39,6 +39,7 @@ done
 command -v c++ >/dev/null || die "no C++ compiler, which the message packages need (Debian and Ubuntu: apt-get install g++)"
 
 mkdir -p "$work"
+touch "$work/COLCON_IGNORE" # the packages in here are not those of a ROS workspace around us
 exec 9>"$work/lock"
 flock 9 # two runs at the same time would build into each other
 
@@ -51,6 +52,7 @@ if [ "$(cat "$venv/wheels.stamp" 2>/dev/null)" != "$wheels_stamp" ]; then
     say "installing rclpy and what builds messages (under a minute)"
     rm -rf "$venv" "$work/packages"
     quietly "making the venv" "$python" -m venv "$venv"
+    touch "$venv/COLCON_IGNORE"
     quietly "installing from PyPI" "$venv/bin/pip" install --disable-pip-version-check --quiet \
         -r tests/rclpy/requirements.txt -c tests/rclpy/constraints.txt
     # The wheels' CMake files name the header folders of the machine they were built on.
@@ -105,7 +107,7 @@ if [ "$(cat "$venv/messages.stamp" 2>/dev/null)" != "$messages_stamp" ]; then
         name=$(sed -n 's#.*<name>\(.*\)</name>.*#\1#p' "$package/package.xml")
         # Quick to build is worth more here than quick to run.
         quietly "configuring $name" cmake -G Ninja -S "$package" -B "$work/$name" -DCMAKE_BUILD_TYPE=None \
-            -DCMAKE_C_FLAGS=-O1 -DCMAKE_CXX_FLAGS=-O1 -DBUILD_TESTING=OFF \
+            -DCMAKE_C_FLAGS=-O0 -DCMAKE_CXX_FLAGS=-O0 -DBUILD_TESTING=OFF \
             -DCMAKE_PREFIX_PATH="$venv" -DCMAKE_INSTALL_PREFIX="$venv" -DPython3_EXECUTABLE="$venv/bin/python"
         quietly "building $name" cmake --build "$work/$name"
         quietly "installing $name" cmake --install "$work/$name"

@@ -1,5 +1,5 @@
-"""What the tests share: the real binaries as processes, rclpy nodes that are spun until something happens, and puzzles with
-truth.
+"""What the tests share: the real binaries as processes, rclpy nodes that are spun until something happens, and puzzles
+with truth.
 
 Nothing here sleeps: a test waits for an event, and a time limit turns a missing event into a failure.
 """
@@ -21,28 +21,24 @@ ROOT = HERE.parent.parent
 
 # Read by the middleware when a participant is made, so before anything imports rclpy.
 os.environ["FASTDDS_DEFAULT_PROFILES_FILE"] = str(HERE / "fastdds_loopback.xml")
-os.environ["FASTRTPS_DEFAULT_PROFILES_FILE"] = str(HERE / "fastdds_loopback.xml")
 os.environ["AMENT_PREFIX_PATH"] = sys.prefix
 os.environ["RMW_IMPLEMENTATION"] = "rmw_fastrtps_cpp"
 os.environ.pop("ROS_LOCALHOST_ONLY", None)
 
-import pytest  # noqa: E402
-import rclpy  # noqa: E402
-from rclpy.executors import SingleThreadedExecutor  # noqa: E402
-from rclpy.qos import QoSDurabilityPolicy, QoSProfile, QoSReliabilityPolicy  # noqa: E402
+import pytest
+import rclpy
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.qos import QoSDurabilityPolicy, QoSProfile, QoSReliabilityPolicy
 
 EVENT_TIMEOUT = 30.0  # seconds until an awaited event counts as missing; on an idle machine all come within 2
+ANSWER_PATIENCE = 5.0  # seconds until a call is made again; a request that is sent again by DDS itself takes 3
 EXIT_TIMEOUT = 10.0  # seconds that a process may take to end after SIGTERM
 
-LATCHED = QoSProfile(
-    depth=1, reliability=QoSReliabilityPolicy.RELIABLE, durability=QoSDurabilityPolicy.TRANSIENT_LOCAL
-)
-BEST_EFFORT = QoSProfile(depth=10, reliability=QoSReliabilityPolicy.BEST_EFFORT)
+LATCHED = QoSProfile(depth=1, reliability=QoSReliabilityPolicy.RELIABLE, durability=QoSDurabilityPolicy.TRANSIENT_LOCAL)
 
 # RTPS: the discovery port of the first participant of a domain, and what lies between those of two domains.
 FIRST_PORT, PORTS_PER_DOMAIN = 7410, 250
 LAST_DOMAIN = 99  # above about 100 the ports reach into those that Linux gives out
-
 
 
 @pytest.fixture(scope="session")
@@ -190,27 +186,46 @@ class Harness:
         self.executor.add_node(node)
         return node
 
-    def until(self, condition, what, timeout=EVENT_TIMEOUT):
+    def until(self, condition, what, timeout=EVENT_TIMEOUT, required=True):
         """Spins until the condition gives something true, and gives that back."""
         deadline = time.monotonic() + timeout
         while not (result := condition()):
             if time.monotonic() > deadline:
+                if not required:
+                    return None
                 pytest.fail(f"after {timeout} s still no {what}")
             self.executor.spin_once(timeout_sec=0.05)
         return result
 
     def call(self, client, request, timeout=EVENT_TIMEOUT):
-        """Calls a service and gives its answer."""
+        """Calls a service and gives its answer.
+
+        Right after discovery a server may not know yet where answers go, and the first one is lost; so the call is made
+        again. Every service called here may be called twice.
+        """
         self.until(client.service_is_ready, f"service {client.srv_name}", timeout)
-        future = client.call_async(request)
-        self.until(future.done, f"answer of {client.srv_name}", timeout)
-        return future.result()
+        futures = []
+
+        def answered():
+            return next((future for future in futures if future.done()), None)
+
+        for last in (False, False, True):
+            futures.append(client.call_async(request))
+            what = f"answer of {client.srv_name}"
+            if future := self.until(answered, what, timeout if last else ANSWER_PATIENCE, required=last):
+                return future.result()
 
     def latest(self, node, message_type, topic, qos=LATCHED):
         """Subscribes; the returned list always holds what came."""
         received = []
         node.create_subscription(message_type, topic, received.append, qos)
         return received
+
+    def first(self, message_type, topic, qos=LATCHED):
+        """Waits for the first message on a topic, latched ones by default."""
+        node = self.node(f"waits_for_{topic.strip('/').replace('/', '_')}")
+        received = self.latest(node, message_type, topic, qos)
+        return self.until(lambda: received, f"message on {topic}")[0]
 
     def close(self):
         self.executor.shutdown()

@@ -5,9 +5,12 @@ import json
 
 import numpy as np
 import pytest
+from geometry_msgs.msg import Twist
+from jigsaw_msgs.msg import Assembly, PiecePose
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 from PIL import Image as Picture
+from rclpy.serialization import deserialize_message
 from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
 from rosbags.rosbag2 import Reader, StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
@@ -99,6 +102,30 @@ def test_rclpy_gets_every_message_of_a_bag(launcher, ros, tmp_path, plugin):
     for message, sent in zip(got, frames(), strict=True):
         assert (message.header.stamp.sec, message.header.stamp.nanosec) == (sent.header.stamp.sec, 7)
         assert message.data.tobytes() == sent.data.tobytes()
+
+
+def test_topics_of_any_type_are_recorded_from_rclpy(launcher, ros, tmp_path):
+    """Among them one that the recorder was not built with."""
+    bag = tmp_path / "bag"
+    assembly = Assembly(state=Assembly.PARTIAL, pieces=[PiecePose(id="a", confidence=0.5)], unplaced=["b"])
+    twist = Twist()
+    twist.angular.z = 0.25
+    sent = {"/assembly": assembly, "/cmd_vel": twist}
+    node = ros.node("talker")
+    publishers = {topic: node.create_publisher(type(message), topic, 10) for topic, message in sent.items()}
+    recorder = launcher.start("jigsaw", "bag", "record", bag, "--topics", *sent)
+    ros.until(lambda: all(p.get_subscription_count() for p in publishers.values()), "recorder on every topic")
+    for topic, publisher in publishers.items():
+        for _ in range(MESSAGES):
+            publisher.publish(sent[topic])
+            assert publisher.wait_for_all_acked()
+    assert recorder.stop() == 0, recorder.text()
+
+    recorded = read_with_rosbags(bag)
+    assert len(recorded) == MESSAGES * len(sent)
+    for topic, msgtype, data in recorded:
+        assert msgtype.endswith(f"/msg/{type(sent[topic]).__name__}")
+        assert deserialize_message(data, type(sent[topic])) == sent[topic]
 
 
 @pytest.mark.parametrize("name", ["puzzle24", "puzzle6"])

@@ -1,7 +1,7 @@
 """The Rust message types against those that the standard generators made from the same files, and against the wheels.
 
-`transcode` (an example of the crate jigsaw_msgs) decodes bytes into a Rust type and answers with their meaning as JSON, and
-with the bytes that Rust makes of it.
+`transcode` (an example of the crate jigsaw_msgs) decodes bytes into a Rust type and answers with their meaning as JSON,
+and with the bytes that Rust makes of it.
 """
 
 import array
@@ -124,7 +124,9 @@ def test_type_hashes_are_those_of_rosidl(transcode, type_names):
     for full_name in type_names:
         package, kind, name = full_name.split("/")
         description = Path(get_package_share_directory(package), kind, name.split("_")[0] + ".json")
-        hashes = {entry["type_name"]: entry["hash_string"] for entry in json.loads(description.read_text())["type_hashes"]}
+        hashes = {
+            entry["type_name"]: entry["hash_string"] for entry in json.loads(description.read_text())["type_hashes"]
+        }
         assert transcode.ask(full_name)["hash"] == hashes[full_name], full_name
 
 

@@ -5,6 +5,7 @@
 //! recalibrate, merge_islands.
 
 use anyhow::{Context, bail};
+use isthmus::mask;
 use jigsaw::generate::{Cut, Options, Puzzle, Rim};
 use jigsaw::{Params, Piece, Policy, Solver};
 use rayon::prelude::*;
@@ -55,35 +56,28 @@ fn cases() -> Vec<Case> {
 
 /// Pieces from rendered frames (or straight from the outlines).
 fn pieces(puzzle: &Puzzle, frames: bool) -> anyhow::Result<Vec<Piece>> {
-    (0..puzzle.pieces().len())
+    if !frames {
+        return (0..puzzle.pieces().len())
+            .into_par_iter()
+            .map(|k| {
+                let features = isthmus::Features::from_border(puzzle.border(k, 1.0), 0.0)?;
+                Ok(Piece { id: puzzle.pieces()[k].id.clone(), features })
+            })
+            .collect();
+    }
+    (0..puzzle.frame_count())
         .into_par_iter()
         .map(|k| {
-            let id = puzzle.pieces()[k].id.clone();
-            let features = if frames {
-                isthmus::Extractor::default().extract(&cutout(puzzle, k))
-            } else {
-                isthmus::Features::from_border(puzzle.border(k, 1.0), 0.0)
+            let frame = puzzle.render(k);
+            let frame = mask::Frame::grey(frame.width, frame.height, &frame.pixels)?;
+            let segmentation = mask::segment(&frame, &mask::Parameters::default());
+            let [cutout] = &segmentation.cutouts[..] else {
+                bail!("{} shapes in frame {k}", segmentation.cutouts.len())
             };
-            Ok(Piece { features: features.with_context(|| format!("piece {id}"))?, id })
+            let features = isthmus::Extractor::default().extract(cutout).with_context(|| format!("frame {k}"))?;
+            Ok(Piece { id: puzzle.frame_stem(k), features })
         })
         .collect()
-}
-
-fn cutout(puzzle: &Puzzle, k: usize) -> isthmus::mask::Cutout {
-    let frame = puzzle.render(puzzle.pieces()[k].frame);
-    let whole = isthmus::mask::Aoi { x: 0, y: 0, width: frame.width, height: frame.height };
-    let mut shape: Vec<u8> = frame.pixels.iter().copied().filter(|p| *p < 100).collect();
-    let mut ground: Vec<u8> = frame.pixels.iter().copied().filter(|p| *p >= 100).collect();
-    shape.sort_unstable();
-    ground.sort_unstable();
-    isthmus::mask::Cutout {
-        aoi: whole,
-        window: whole,
-        pixels: frame.pixels,
-        shape_level: f32::from(shape[shape.len() / 2]),
-        ground_level: f32::from(ground[ground.len() / 2]),
-        noise_level: puzzle.options().noise as f32,
-    }
 }
 
 fn main() -> anyhow::Result<()> {

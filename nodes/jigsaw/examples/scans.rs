@@ -1,40 +1,69 @@
-//! The solver on folders of real pieces, one silhouette an image (bright on dark).
+//! The solver on folders of pictures of real pieces, one or many to a picture.
 //!
-//! `cargo run --release -p jigsaw --example scans -- FOLDER [--truth solution.csv] [--off SWITCH]`
+//! `cargo run --release -p jigsaw --example scans -- FOLDER [--truth solution.csv] [--out FILE.svg] [--off SWITCH]`
 //! The truth has the columns piece (file stem), column, row, rotation_rad.
 
 use anyhow::{Context, bail};
-use isthmus::mask::{Aoi, Cutout};
-use jigsaw::{Params, Piece, Solver};
+use isthmus::mask::{Frame, Parameters, segment};
+use jigsaw::{Assembly, Params, Piece, Solver};
 use rayon::prelude::*;
 use std::collections::HashMap;
 use std::path::{Path, PathBuf};
 use std::time::Instant;
 
-fn load(path: &Path) -> anyhow::Result<Piece> {
-    let picture = image::open(path).with_context(|| path.display().to_string())?.to_luma8();
-    let (width, height) = picture.dimensions();
-    let window = Aoi { x: 0, y: 0, width, height };
-    let cutout = Cutout {
-        aoi: window,
-        window,
-        pixels: picture.into_raw(),
-        shape_level: 255.0,
-        ground_level: 0.0,
-        noise_level: 0.0,
+/// All pieces of a picture, named as the command line names them.
+fn load(path: &Path) -> anyhow::Result<Vec<Piece>> {
+    let picture = image::open(path).with_context(|| path.display().to_string())?;
+    let (width, height) = (picture.width(), picture.height());
+    let stem = path.file_stem().and_then(|s| s.to_str()).context("file name")?.to_owned();
+    let segmentation = if picture.color().has_color() {
+        let pixels = picture.into_rgb8().into_raw();
+        segment(&Frame::rgb(width, height, &pixels)?, &Parameters::default())
+    } else {
+        let pixels = picture.into_luma8().into_raw();
+        segment(&Frame::grey(width, height, &pixels)?, &Parameters::default())
     };
-    let features = isthmus::Extractor::default().extract(&cutout).with_context(|| path.display().to_string())?;
-    let id = path.file_stem().and_then(|s| s.to_str()).context("file name")?.to_owned();
-    Ok(Piece { id, features })
+    for rejected in &segmentation.rejected {
+        println!("{stem}: {:?} at {:?}, {} px", rejected.reason, rejected.aoi, rejected.area);
+    }
+    let many = segmentation.cutouts.len() > 1;
+    let mut extractor = isthmus::Extractor::default();
+    let mut pieces = Vec::new();
+    for (k, cutout) in segmentation.cutouts.iter().enumerate() {
+        let features = extractor.extract(cutout).with_context(|| path.display().to_string())?;
+        pieces.push(Piece { id: if many { format!("{stem}_{k}") } else { stem.clone() }, features });
+    }
+    Ok(pieces)
+}
+
+/// Outlines in place, as an SVG.
+fn draw(path: &Path, pieces: &[Piece], assembly: &Assembly) -> anyhow::Result<()> {
+    use std::fmt::Write;
+    let mut body = String::new();
+    let (mut width, mut height) = (0.0f64, 0.0f64);
+    for p in &assembly.placements {
+        let mut points = String::new();
+        for q in pieces[p.piece].features.border.points.iter().step_by(3) {
+            let q = p.puzzle_from_image * q;
+            (width, height) = (width.max(q.x), height.max(q.y));
+            write!(points, "{:.1},{:.1} ", q.x, q.y)?;
+        }
+        let hue = p.piece * 47 % 360;
+        writeln!(body, "<polygon points='{points}' fill='hsl({hue},60%,70%)' fill-opacity='0.6'/>")?;
+    }
+    let head = format!("<svg xmlns='http://www.w3.org/2000/svg' width='1600' viewBox='0 0 {width:.0} {height:.0}'>");
+    Ok(std::fs::write(path, format!("{head}\n{body}</svg>\n"))?)
 }
 
 fn main() -> anyhow::Result<()> {
     let mut folder = None;
     let mut truth = None;
+    let mut out = None;
     let mut params = Params::default();
     let mut arguments = std::env::args().skip(1);
     while let Some(argument) = arguments.next() {
         match argument.as_str() {
+            "--out" => out = arguments.next().map(PathBuf::from),
             "--truth" => truth = arguments.next().map(PathBuf::from),
             "--off" => match arguments.next().as_deref() {
                 Some("loops") => params.loops = false,
@@ -51,9 +80,12 @@ fn main() -> anyhow::Result<()> {
     let folder = folder.context("no folder")?;
     let begin = Instant::now();
     let mut files: Vec<PathBuf> = std::fs::read_dir(&folder)?.map(|e| e.map(|e| e.path())).collect::<Result<_, _>>()?;
-    files.retain(|f| f.extension().is_some_and(|e| ["png", "jpg", "jpeg", "bmp"].iter().any(|x| e == *x)));
+    files.retain(|f| {
+        f.extension().is_some_and(|e| ["png", "jpg", "jpeg", "bmp", "tiff", "tif"].iter().any(|x| e == *x))
+    });
     files.sort();
-    let pieces: Vec<Piece> = files.par_iter().map(|f| load(f)).collect::<Result<_, _>>()?;
+    let pieces: Vec<Vec<Piece>> = files.par_iter().map(|f| load(f)).collect::<Result<_, _>>()?;
+    let pieces: Vec<Piece> = pieces.into_iter().flatten().collect();
     println!("{} pieces, features {:.2} s", pieces.len(), begin.elapsed().as_secs_f64());
     let mut solver = Solver::new(params)?;
     for piece in &pieces {
@@ -72,6 +104,9 @@ fn main() -> anyhow::Result<()> {
         "mean gap {residual:.2} px, clearance {:?}",
         [0.05, 0.5, 0.95].map(|q| clearances.get((q * clearances.len() as f64) as usize))
     );
+    if let Some(out) = out {
+        draw(&out, &pieces, &assembly)?;
+    }
     if let Some(truth) = truth {
         let text = std::fs::read_to_string(truth)?;
         let mut cell = HashMap::new();

@@ -46,7 +46,7 @@ fn bounds(
     let mut low = Vector2::repeat(f64::INFINITY);
     let mut high = Vector2::repeat(f64::NEG_INFINITY);
     for &k in members {
-        for p in &outlines[k].points {
+        for p in &outlines[k].hull {
             let p = turn * (poses[k] * p);
             low = low.inf(&p.coords);
             high = high.sup(&p.coords);
@@ -57,7 +57,7 @@ fn bounds(
 
 fn upright(outlines: &[&Outline], poses: &[Isometry2<f64>], members: &[usize]) -> UnitComplex<f64> {
     let points: Vec<Point> =
-        members.iter().flat_map(|k| outlines[*k].points.iter().map(move |p| poses[*k] * p)).collect();
+        members.iter().flat_map(|k| outlines[*k].hull.iter().map(move |p| poses[*k] * p)).collect();
     let hull = convex_hull(points);
     let perimeter: f64 = (0..hull.len()).map(|i| (hull[(i + 1) % hull.len()] - hull[i]).norm()).sum();
     let edges: Vec<Vector2<f64>> = members
@@ -98,7 +98,7 @@ fn straight_direction(edges: &[Vector2<f64>], perimeter: f64) -> Option<f64> {
 }
 
 /// Convex hull (Andrew 1979), running so that the turn is never negative.
-fn convex_hull(mut points: Vec<Point>) -> Vec<Point> {
+pub(crate) fn convex_hull(mut points: Vec<Point>) -> Vec<Point> {
     points.sort_by(|p, q| p.x.total_cmp(&q.x).then(p.y.total_cmp(&q.y)));
     let half = |points: &mut dyn Iterator<Item = Point>| {
         let mut hull: Vec<Point> = Vec::new();

@@ -4,6 +4,7 @@
 //! Coordinates are pixels of the piece's image (x right, y down) unless said otherwise.
 
 use crate::Piece;
+use crate::frame::convex_hull;
 use isthmus::Point;
 use isthmus::isthmus::{Isthmus, Polarity};
 use nalgebra::{Isometry2, Matrix3, Matrix4, Vector2, Vector3, Vector4};
@@ -92,6 +93,8 @@ pub(crate) struct Outline {
     pub(crate) tabs: Vec<Segment>,
     pub(crate) mouths: Vec<Segment>,
     pub(crate) straights: Vec<Straight>,
+    /// Convex hull.
+    pub(crate) hull: Vec<Point>,
     pub(crate) raster: Raster,
 }
 
@@ -122,6 +125,7 @@ impl Outline {
         let radius = points.iter().map(|p| (p - centroid).norm()).fold(0.0, f64::max);
         let mut outline = Self {
             raster: Raster::new(&points, &normals, area.sqrt() / RASTER_CELLS),
+            hull: convex_hull(points.clone()),
             points,
             normals,
             spacing,
@@ -418,6 +422,12 @@ pub(crate) fn overlap_area(a: &Outline, b: &Outline, b_from_a: &Isometry2<f64>) 
     intrusion(a, b, b_from_a).max(intrusion(b, a, &b_from_a.inverse()))
 }
 
+/// Least width of the robust weights, in piece scales: where most of a contact fits exactly already, the rest must
+/// still pull.
+pub(crate) const LEAST_WIDTH: f64 = 0.004;
+/// Contacts of fewer rows than this part of a scale are corners that meet, which say nothing about a pose.
+const LEAST_CONTACT: f64 = 0.12;
+
 /// What two outlines in a given pose say about each other.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct Contact {
@@ -496,7 +506,7 @@ pub(crate) fn contact(
             rows.push((distance, normal, p));
         }
     }
-    if rows.len() < 4 {
+    if rows.len() < 4 || rows.len() as f64 * stride as f64 * a.spacing < LEAST_CONTACT * a.scale {
         return None;
     }
     let mut distances: Vec<f64> = rows.iter().map(|r| r.0).collect();
@@ -504,7 +514,7 @@ pub(crate) fn contact(
     let clearance = *distances.select_nth_unstable_by(middle, f64::total_cmp).1;
     let mut off: Vec<f64> = rows.iter().map(|r| (r.0 - clearance).abs()).collect();
     let spread = *off.select_nth_unstable_by(middle, f64::total_cmp).1;
-    let width = (3.0 * spread).max(1e-3);
+    let width = (3.0 * spread).max(LEAST_WIDTH * b.scale);
     let centre = Point::from(rows.iter().fold(Vector2::zeros(), |s, r| s + r.2.coords) / rows.len() as f64);
     let mut h = Matrix4::zeros();
     let mut g = Vector4::zeros();

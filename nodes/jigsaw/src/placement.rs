@@ -13,7 +13,7 @@
 //! Complexity O(iterations · samples), some 10 µs. Fails where the first pose is off by more than about half a neck,
 //! and slides where the borders are near-circular or straight: the clearance is clamped and damped.
 
-use crate::outline::{Node, SHAPE_SAMPLES, Segment};
+use crate::outline::{LEAST_WIDTH, Node, SHAPE_SAMPLES, Segment};
 use nalgebra::{Isometry2, Matrix3, Matrix4, Point2, Vector2, Vector3, Vector4};
 
 /// Limit of the fitted clearance in piece scales: no cut or segmentation takes more, and a free fit may diverge.
@@ -24,6 +24,8 @@ pub(crate) const RESIDUAL_CAP: f64 = 0.02;
 const MAX_TURN: f64 = 0.1;
 /// Weight of "no clearance" against that of all samples: enough where nothing else tells clearance from shift.
 const CLEARANCE_DAMPING: f64 = 0.002;
+/// Steps from a rough pose to a refined one; Gauss-Newton on feet that hardly move converges in two or three.
+const REFINEMENTS: usize = 3;
 /// Samples of the match segment for a rough pose.
 const ROUGH_SAMPLES: usize = 20;
 
@@ -169,6 +171,8 @@ fn foot(run: &[Node], at: &mut usize, p: Vector2<f64>) -> Option<(f64, Vector2<f
 struct Feet {
     at: Vec<usize>,
     rows: Vec<(f64, Vector2<f64>, Vector2<f64>)>,
+    /// The rows on the match segment proper.
+    core: std::ops::Range<usize>,
     off: Vec<f64>,
 }
 
@@ -182,22 +186,30 @@ impl Feet {
                 s.clamp(0.0, (mouth.run.len() - 1) as f64) as usize
             })
             .collect();
-        Self { at, rows: Vec::with_capacity(tab.run.len()), off: Vec::with_capacity(tab.run.len()) }
+        Self { at, rows: Vec::with_capacity(tab.run.len()), core: 0..0, off: Vec::with_capacity(tab.run.len()) }
     }
 
     fn find(&mut self, tab: &Segment, mouth: &Segment, range: impl Iterator<Item = usize>, pose: &Pose) {
         self.rows.clear();
+        self.core = 0..0;
         for k in range {
             let p = pose.apply(&tab.run[k]);
             if let Some((distance, normal)) = foot(&mouth.run, &mut self.at[k], p) {
                 self.rows.push((distance, normal, p));
             }
+            if k < tab.core.start {
+                self.core.start = self.rows.len();
+            }
+            if k < tab.core.end {
+                self.core.end = self.rows.len();
+            }
         }
     }
 
-    /// Mean capped residual.
-    fn residual(&self, clearance: f64, cap: f64) -> f64 {
-        self.rows.iter().map(|r| (r.0 - clearance).abs().min(cap)).sum::<f64>() / self.rows.len().max(1) as f64
+    /// Mean capped residual of some rows.
+    fn residual(&self, rows: std::ops::Range<usize>, clearance: f64, cap: f64) -> f64 {
+        let count = rows.len().max(1) as f64;
+        self.rows[rows].iter().map(|r| (r.0 - clearance).abs().min(cap)).sum::<f64>() / count
     }
 
     fn spread(&mut self, clearance: f64) -> f64 {
@@ -213,7 +225,7 @@ impl Feet {
 
 /// One step of weighted least squares; returns the normal matrix over (x, y, turn, clearance) about the local origin.
 fn step(feet: &mut Feet, pose: &mut Pose, clearance: &mut f64, free: bool, limit: f64) -> Matrix4<f64> {
-    let width = (3.0 * feet.spread(*clearance)).max(1e-3);
+    let width = (3.0 * feet.spread(*clearance)).max(LEAST_WIDTH / MAX_CLEARANCE * limit);
     let mut h = Matrix4::zeros();
     let mut g = Vector4::zeros();
     let mut total = 0.0;
@@ -280,7 +292,7 @@ pub(crate) fn rough(tab: &Segment, mouth: &Segment, scale: f64, free: bool) -> O
     if feet.rows.len() * stride < tab.core.len() / 2 {
         return None;
     }
-    Some(Rough { pose, clearance, residual: feet.residual(clearance, RESIDUAL_CAP * scale) })
+    Some(Rough { pose, clearance, residual: feet.residual(0..feet.rows.len(), clearance, RESIDUAL_CAP * scale) })
 }
 
 /// Refines a rough pose on the extended match segment.
@@ -289,10 +301,8 @@ pub(crate) fn refine(tab: &Segment, mouth: &Segment, from: &Rough, scale: f64, f
     let limit = MAX_CLEARANCE * scale;
     let cap = RESIDUAL_CAP * scale;
     let mut feet = Feet::new(tab, mouth);
-    feet.find(tab, mouth, tab.core.clone(), &pose);
-    step(&mut feet, &mut pose, &mut clearance, free, limit);
     let mut h = Matrix4::zeros();
-    for _ in 0..3 {
+    for _ in 0..REFINEMENTS {
         feet.find(tab, mouth, 0..tab.run.len(), &pose);
         h = step(&mut feet, &mut pose, &mut clearance, free, limit);
     }
@@ -300,8 +310,7 @@ pub(crate) fn refine(tab: &Segment, mouth: &Segment, from: &Rough, scale: f64, f
     if feet.rows.len() < tab.core.len() / 2 {
         return None;
     }
-    let residual = feet.residual(clearance, cap);
-    feet.find(tab, mouth, tab.core.clone(), &pose);
+    let residual = feet.residual(0..feet.rows.len(), clearance, cap);
     Some(fit_of(tab, mouth, &feet, &pose, clearance, residual, cap, reduced(&h, free)))
 }
 
@@ -317,7 +326,7 @@ fn fit_of(
     information: Matrix3<f64>,
 ) -> Fit {
     let (mut pos_gap, mut neg_gap) = (0.0, 0.0);
-    for (distance, ..) in &feet.rows {
+    for (distance, ..) in &feet.rows[feet.core.clone()] {
         if *distance < 0.0 { pos_gap -= distance * tab.step } else { neg_gap += distance * tab.step }
     }
     let rotation = nalgebra::UnitComplex::from_cos_sin_unchecked(pose.cos, pose.sin);
@@ -326,7 +335,7 @@ fn fit_of(
         negative_from_positive: Isometry2::from_parts(translation.into(), rotation),
         clearance,
         residual,
-        ave_gap: feet.residual(clearance, cap),
+        ave_gap: feet.residual(feet.core.clone(), clearance, cap),
         pos_gap,
         neg_gap,
         information,
@@ -342,7 +351,7 @@ pub(crate) fn as_posed(tab: &Segment, mouth: &Segment, pose: &Isometry2<f64>, sc
     if feet.rows.len() < tab.core.len() / 2 {
         return None;
     }
-    let residual = feet.residual(0.0, f64::INFINITY);
+    let residual = feet.residual(feet.core.clone(), 0.0, f64::INFINITY);
     Some(fit_of(tab, mouth, &feet, &pose, 0.0, residual, RESIDUAL_CAP * scale, Matrix3::identity()))
 }
 

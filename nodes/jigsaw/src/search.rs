@@ -33,6 +33,10 @@ const TIGHT: Tolerance = Tolerance { position: 0.003, angle: 0.003 };
 const AGREE: Tolerance = Tolerance { position: 0.05, angle: 0.08 };
 /// The same when calibrated, at least.
 const MIN_AGREE: Tolerance = Tolerance { position: 0.015, angle: 0.02 };
+/// Steps along the border in an adjustment, in piece scales: while growing, and at the end, where 200 points around a
+/// piece leave a tenth of the noise of one.
+const COARSE: f64 = 0.05;
+const FINE: f64 = 0.02;
 /// Adjustments at the end: two bring the poses to a tenth of what the border's noise leaves.
 const FINAL_ROUNDS: usize = 2;
 /// Candidates of each mouth (and tab) that take part in loops: more and chance loops drown the true ones.
@@ -119,8 +123,12 @@ const STRONG: f64 = 12.0;
 const AGREEMENT: f64 = 4.0;
 /// Evidence that a join must have: odds of fifty to one.
 const ACCEPT: f64 = 4.0;
-/// Evidence below which a candidate speaks against the pose it proposes.
+/// Evidence below which a candidate is no mating, whatever supports it.
 const IMPLAUSIBLE: f64 = -6.0;
+/// Most that one candidate counts against the pose that it shares with others.
+const WORN: f64 = -3.0;
+/// How much farther apart the poses of two candidates may be for each scale that lies between them (their turn).
+const SWING: f64 = 0.008;
 
 struct Assembler<'a> {
     outlines: &'a [&'a Outline],
@@ -224,11 +232,11 @@ impl Assembler<'_> {
         self.islands(&found);
         let trusted: Vec<usize> = self.state.joined.clone();
         self.learn(&trusted);
-        self.refine_all(1);
+        self.refine_all(1, COARSE);
         self.grow();
         self.verify();
         self.improve();
-        self.refine_all(FINAL_ROUNDS);
+        self.refine_all(FINAL_ROUNDS, FINE);
         self.finish(joints)
     }
 
@@ -463,6 +471,35 @@ impl Assembler<'_> {
         true
     }
 
+    /// Joins two islands in the pose that suits all of several candidates best.
+    fn join_by_all(&mut self, members: &[usize]) -> bool {
+        let first = &self.edges[members[0]];
+        let (ia, ib) = (self.state.island[first.a], self.state.island[first.b]);
+        let (mut here, mut there) = (Vec::new(), Vec::new());
+        for &k in members {
+            let e = &self.edges[k];
+            let centre = self.outlines[e.a].tabs[e.tab].origin;
+            for (dx, dy) in [(0.3, 0.0), (-0.3, 0.0), (0.0, 0.3), (0.0, -0.3)] {
+                let p = centre + Vector2::new(dx, dy) * self.scale;
+                let (in_a, in_b) = (self.state.pose[e.a] * p, self.state.pose[e.b] * (e.b_from_a * p));
+                let forward = self.state.island[e.a] == ia;
+                here.push(if forward { in_a } else { in_b });
+                there.push(if forward { in_b } else { in_a });
+            }
+        }
+        let pose = placement::rigid_fit(&here, &there);
+        if !self.merge(ia, ib, &pose) {
+            return false;
+        }
+        self.take(members[0]);
+        true
+    }
+
+    /// Where a piece's centroid lies in its island.
+    fn centre_of(&self, piece: usize) -> Point2<f64> {
+        self.state.pose[piece] * self.outlines[piece].centroid
+    }
+
     fn take(&mut self, k: usize) {
         for s in self.edges[k].slots() {
             self.state.used.insert(s, k);
@@ -496,7 +533,7 @@ impl Assembler<'_> {
             && size >= 3 * self.state.refined[to].max(2) / 2
         {
             self.state.refined[to] = size;
-            self.adjust(to);
+            self.adjust(to, COARSE);
         }
         true
     }
@@ -556,7 +593,7 @@ impl Assembler<'_> {
     }
 
     /// Adjusts all poses of an island to all contacts of its outlines.
-    fn adjust(&mut self, island: usize) {
+    fn adjust(&mut self, island: usize, step: f64) {
         let members = self.state.members[island].clone();
         if members.len() < 2 {
             return;
@@ -572,7 +609,7 @@ impl Assembler<'_> {
         let factors: Vec<Factor> = pairs
             .par_iter()
             .filter_map(|&(p, q)| {
-                let c = self.contact_of(p, q, &(self.state.pose[q].inverse() * self.state.pose[p]))?;
+                let c = self.contact_of(p, q, &(self.state.pose[q].inverse() * self.state.pose[p]), step)?;
                 let pose = self.state.pose[q];
                 let r = pose.rotation.to_rotation_matrix();
                 let mut turn = Matrix3::identity();
@@ -598,21 +635,20 @@ impl Assembler<'_> {
         }
     }
 
-    fn contact_of(&self, p: usize, q: usize, q_from_p: &Isometry2<f64>) -> Option<Contact> {
+    fn contact_of(&self, p: usize, q: usize, q_from_p: &Isometry2<f64>, step: f64) -> Option<Contact> {
         let (a, b) = (self.outlines[p], self.outlines[q]);
-        // About 200 points around a piece: more adds nothing to an adjustment.
-        let stride = ((a.scale / 50.0 / a.spacing) as usize).max(1);
+        let stride = ((a.scale * step / a.spacing) as usize).max(1);
         contact(a, b, q_from_p, CONTACT_BAND * self.scale, stride, &self.prior)
     }
 
-    fn refine_all(&mut self, rounds: usize) {
+    fn refine_all(&mut self, rounds: usize, step: f64) {
         if !self.params.pose_graph {
             return;
         }
         for island in 0..self.state.members.len() {
             if self.state.members[island].len() > 1 {
                 for _ in 0..rounds {
-                    self.adjust(island);
+                    self.adjust(island, step);
                 }
             }
         }
@@ -633,7 +669,8 @@ impl Assembler<'_> {
                 if self.same_island(members[0]) || (members.len() > 1 && members.iter().any(|k| !self.free(*k))) {
                     continue;
                 }
-                if self.join(members[0]) {
+                let ok = if members.len() > 1 { self.join_by_all(&members) } else { self.join(members[0]) };
+                if ok {
                     joined += 1;
                     for k in &members[1..] {
                         if self.admissible(*k) {
@@ -645,7 +682,7 @@ impl Assembler<'_> {
             if joined == 0 {
                 return;
             }
-            self.refine_all(1);
+            self.refine_all(1, COARSE);
         }
     }
 
@@ -683,6 +720,10 @@ impl Assembler<'_> {
                         &(poses[i] * self.state.pose[piece]),
                         &(poses[j] * self.state.pose[piece]),
                     );
+                    // The turn of one joint swings what is far from it.
+                    let own = &self.edges[*k];
+                    let here = if self.state.island[own.a] == low { own.a } else { own.b };
+                    let far = (self.centre_of(here) - self.centre_of(piece)).norm() / self.scale;
                     let slots = e.slots();
                     let distinct = group.iter().all(|g| {
                         self.edges[*g]
@@ -690,7 +731,7 @@ impl Assembler<'_> {
                             .iter()
                             .all(|s| slots.iter().all(|t| !conflict(self.outlines[s.piece], *s, *t)))
                     });
-                    if j != i && distinct && d < self.agree.position && turn < self.agree.angle {
+                    if j != i && distinct && d < AGREE.position + SWING * far && turn < AGREE.angle {
                         group.push(*other);
                     }
                 }
@@ -706,11 +747,8 @@ impl Assembler<'_> {
     fn evidence(&self, group: &[usize]) -> Option<f64> {
         let mut sum = AGREEMENT * (group.len() - 1) as f64;
         for &k in group {
-            let own = self.model.evidence(self.edges[k].cost);
-            if own < IMPLAUSIBLE {
-                return None;
-            }
-            sum += own;
+            // A worn joint among agreeing ones doesn't refute them.
+            sum += self.model.evidence(self.edges[k].cost).max(WORN);
         }
         if group.len() == 1 {
             sum = sum.min(self.lead(group[0]));
@@ -764,7 +802,7 @@ impl Assembler<'_> {
                 return;
             }
             self.detach(&evict, &broken);
-            self.refine_all(1);
+            self.refine_all(1, COARSE);
         }
     }
 
@@ -873,7 +911,13 @@ impl Assembler<'_> {
         let n = self.outlines.len();
         let mut matings = Vec::new();
         let mut taken: HashMap<Slot, usize> = HashMap::new();
-        let mut order: Vec<usize> = (0..self.edges.len()).filter(|k| self.same_island(*k) && self.agrees(*k)).collect();
+        let paper = self.params.policy == Policy::Paper;
+        // Unrefined poses contradict each other too much to recognise contacts that weren't decided on.
+        let mut order: Vec<usize> = if paper {
+            self.state.joined.clone()
+        } else {
+            (0..self.edges.len()).filter(|k| self.same_island(*k) && self.agrees(*k)).collect()
+        };
         order.sort_by(|p, q| joints[*p].fit.residual.total_cmp(&joints[*q].fit.residual).then(p.cmp(q)));
         // Contacts that agree with a piece's pose: each beyond the first confirms it.
         let mut evidence = vec![0.0f64; n];
@@ -882,7 +926,7 @@ impl Assembler<'_> {
             let slots = self.edges[k].slots();
             let own = self.model.evidence(self.edges[k].cost);
             let loops = self.edges[k].support.min(2) as f64 * AGREEMENT;
-            if slots.iter().any(|s| taken.contains_key(s)) || own + loops < IMPLAUSIBLE {
+            if slots.iter().any(|s| taken.contains_key(s)) || (!paper && own + loops < IMPLAUSIBLE) {
                 continue;
             }
             for s in slots {

@@ -495,7 +495,7 @@ fn count(outlines: &[&Outline], joints: &[Joint]) -> TableCounts {
 const REFINED: usize = 4;
 /// More are refined if their rough residual is at most this many times the best one's, and this much more, in piece
 /// scales: what a rough pose may be off.
-const ROUGHLY: (f64, f64) = (2.5, 0.003);
+const ROUGHLY: (f64, f64) = (2.0, 0.0015);
 
 /// Places in a mouth's list of the candidates to refine, best rough pose first.
 fn best_places(list: &[Match], scale: f64) -> Vec<usize> {

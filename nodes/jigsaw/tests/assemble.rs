@@ -1,7 +1,7 @@
 //! The whole solver on generated puzzles, whose truth is known.
 
-use jigsaw::generate::{Options, Puzzle, Score};
-use jigsaw::{Assembly, Params, Piece, Solver};
+use jigsaw::generate::{Cut, Options, Puzzle, Rim, Score};
+use jigsaw::{Assembly, Params, Piece, Policy, Solver};
 
 /// Worst piece of a 4 x 6 puzzle from exact outlines, in pixels: the border is sampled at 1 px.
 const EXACT_OFFSET: f64 = 0.06;
@@ -31,6 +31,64 @@ fn a_clean_puzzle_is_assembled_exactly() {
         assert!(score.worst_offset < EXACT_OFFSET, "seed {seed}: {score:?}");
         assert!(assembly.unplaced.is_empty());
     }
+}
+
+/// Everything that a heap may hold beside one whole puzzle; pieces left over are fine where nothing holds them.
+#[test]
+fn incomplete_and_mixed_heaps_make_no_wrong_mating() {
+    let cases = [
+        ("missing", Options { missing: 4, ..Options::default() }),
+        ("twice", Options { duplicate: 3, ..Options::default() }),
+        ("flipped", Options { flipped: 2, ..Options::default() }),
+        ("mixed", Options { puzzles: 2, rows: 3, ..Options::default() }),
+        ("wavy", Options { wavy: 0.1, ..Options::default() }),
+        ("patch", Options { rim: Rim::Patch, ..Options::default() }),
+        ("ragged", Options { rim: Rim::Ragged, rows: 5, ..Options::default() }),
+        ("brick", Options { cut: Cut::Brick, ..Options::default() }),
+        ("honeycomb", Options { cut: Cut::Honeycomb, ..Options::default() }),
+        ("alike", Options { similarity: 0.98, ..Options::default() }),
+        ("clearance", Options { clearance: [0.0, 4.0], ..Options::default() }),
+    ];
+    for (name, options) in cases {
+        let (score, _) = solve(&Options { seed: 31, ..options.clone() }, &Params::default());
+        assert_eq!((score.misplaced, score.wrong_matings), (0, 0), "{name}: {score:?}");
+        assert_eq!(score.right_matings, score.joints, "{name}: {score:?}");
+        if options.missing == 0 {
+            assert_eq!(score.placed, score.pieces, "{name}: {score:?}");
+        }
+    }
+}
+
+#[test]
+fn clearance_is_measured_joint_by_joint() {
+    /// Greatest error of a joint's clearance on exact outlines, in pixels.
+    const CLEARANCE: f64 = 0.1;
+    let (score, _) = solve(&Options { clearance: [0.0, 4.0], seed: 41, ..Options::default() }, &Params::default());
+    assert!(score.is_perfect() && score.worst_clearance < CLEARANCE, "{score:?}");
+}
+
+#[test]
+fn the_literal_rules_thin_out_the_table_step_by_step() {
+    let params = Params { policy: Policy::Paper, backtracks: 20, ..Params::default() };
+    // The paper's rules need mouths wider than necks: a puzzle cut with clearance.
+    let options = Options { rows: 2, columns: 3, clearance: [1.0, 1.0], seed: 4, ..Options::default() };
+    let (_, assembly) = solve(&options, &params);
+    let t = assembly.table;
+    let steps = [t.pairs, t.after_opening, t.after_length, t.after_correlation, t.after_overlap];
+    assert!(steps.windows(2).all(|w| w[0] >= w[1]), "{t:?}");
+    assert!(t.pairs > t.after_overlap && t.after_overlap >= 7, "{t:?}");
+}
+
+/// The greedy descent of the paper takes a wrong pair early, after which pieces can't be joined up.
+#[test]
+fn backtracking_mends_what_the_greedy_descent_spoils() {
+    let options = Options { rows: 3, columns: 3, clearance: [0.2, 0.2], seed: 1, ..Options::default() };
+    let paper = |backtracks| Params { policy: Policy::Paper, backtracks, ..Params::default() };
+    let (greedy, _) = solve(&options, &paper(0));
+    assert!(greedy.misplaced > 0 && !greedy.is_perfect(), "{greedy:?}");
+    let (mended, assembly) = solve(&options, &paper(1000));
+    assert!(mended.is_perfect(), "{mended:?}");
+    assert!(assembly.table.backtracks > 0 && assembly.unplaced.is_empty(), "{:?}", assembly.table);
 }
 
 #[test]

@@ -1,0 +1,222 @@
+"""What stands at both ends of the cell: a camera that publishes the frames of a puzzle, and an arm that reads where
+each piece lies and where it goes. Both are plain rclpy nodes that know the contract alone."""
+
+import cmath
+import io
+from dataclasses import dataclass
+
+import numpy
+from builtin_interfaces.msg import Time
+from jigsaw_msgs.msg import Assembly, PieceFeatures
+from PIL import Image as Picture
+from rclpy.qos import QoSDurabilityPolicy, QoSProfile, QoSReliabilityPolicy
+from sensor_msgs.msg import CompressedImage, Image
+from tf2_msgs.msg import TFMessage
+
+METRES_PER_PIXEL = 0.00025  # not the default, so that a forgotten scale shows
+
+POSITION_TOLERANCE_PX = 0.5  # of a piece's goal, after one rigid motion of the whole puzzle
+SIGHTING_TOLERANCE_PX = 1.0  # of a piece's centroid where it lies: the generator's blur and the kerf move it a little
+ANGLE_TOLERANCE = 0.005  # [rad], half a pixel at the rim of a piece
+
+LATCHED_PIECES = QoSProfile(
+    depth=1000, reliability=QoSReliabilityPolicy.RELIABLE, durability=QoSDurabilityPolicy.TRANSIENT_LOCAL
+)
+BEST_EFFORT = QoSProfile(depth=5, reliability=QoSReliabilityPolicy.BEST_EFFORT)
+RELIABLE = QoSProfile(depth=100, reliability=QoSReliabilityPolicy.RELIABLE)
+
+ENCODINGS = {
+    "mono8": lambda grey: grey,
+    "rgb8": lambda grey: numpy.repeat(grey[:, :, None], 3, axis=2),
+    "bgr8": lambda grey: numpy.repeat(grey[:, :, None], 3, axis=2),
+    "mono16": lambda grey: grey.astype(numpy.uint16) * 257,
+}
+
+
+def image_message(grey, stamp, encoding="mono8"):
+    """A grey picture as sensor_msgs/Image."""
+    pixels = numpy.ascontiguousarray(ENCODINGS[encoding](grey))
+    message = Image(height=grey.shape[0], width=grey.shape[1], encoding=encoding)
+    message.header.frame_id = "camera"
+    message.header.stamp = stamp
+    message.step = pixels.strides[0]
+    message.data.frombytes(pixels.tobytes())
+    return message
+
+
+def compressed_message(grey, stamp, file_format="png"):
+    """A grey picture as sensor_msgs/CompressedImage."""
+    out = io.BytesIO()
+    Picture.fromarray(grey).save(out, file_format)
+    message = CompressedImage(format=file_format)
+    message.header.frame_id = "camera"
+    message.header.stamp = stamp
+    message.data.frombytes(out.getvalue())
+    return message
+
+
+class Camera:
+    """Publishes each frame with a stamp of its own until the cell has told of it: best effort may lose one."""
+
+    def __init__(self, ros, topic="image", compressed=False, features="pieces/features"):
+        self.ros = ros
+        self.node = ros.node("camera")
+        if compressed:
+            self.publisher = self.node.create_publisher(CompressedImage, topic, RELIABLE)
+        else:
+            self.publisher = self.node.create_publisher(Image, topic, BEST_EFFORT)
+        self.features = {}  # by the stamp's seconds
+        self.sent = 0
+        self.node.create_subscription(PieceFeatures, features, self.take, LATCHED_PIECES)
+
+    def take(self, features):
+        self.features.setdefault(features.header.stamp.sec, []).append(features)
+
+    def show(self, message, attempts=5):
+        """Publishes until the features of the frame come back; gives them."""
+        second = message.header.stamp.sec
+        self.ros.until(lambda: self.publisher.get_subscription_count() > 0, f"listener on {self.publisher.topic_name}")
+        for attempt in range(attempts):
+            self.publisher.publish(message)
+            self.sent += 1
+            last = attempt == attempts - 1
+            if self.ros.until(lambda: self.features.get(second), f"features of frame {second}", 5, required=last):
+                return self.features[second]
+
+    def show_puzzle(self, puzzle, make=image_message, **options):
+        """Shows every frame; gives the truth of each piece by the id that the cell gave it."""
+        truth = {}
+        for second, piece in enumerate(puzzle.truth["pieces"], start=1):
+            with Picture.open(puzzle.folder / piece["source"]) as picture:
+                grey = numpy.asarray(picture.convert("L"))
+            features = self.show(make(grey, Time(sec=second, nanosec=500), **options))
+            assert len(features) == 1, f"{piece['source']} holds one piece, the cell saw {len(features)}"
+            assert features[0].header.frame_id == "camera"
+            assert features[0].header.stamp.nanosec == 500
+            truth[features[0].id] = TruePiece(piece, grey.shape[1], grey.shape[0])
+        return truth
+
+
+@dataclass
+class TruePiece:
+    """What truth.json says of a piece, in the axes of the cell's frames: complex numbers, x right, y up, metres."""
+
+    piece: dict
+    width: int
+    height: int
+
+    @property
+    def on_table(self):
+        """The centroid, from the centre of the frame."""
+        x, y = self.piece["centroid"]
+        centre = complex((self.width - 1) / 2, (self.height - 1) / 2)
+        return (complex(x, y) - centre).conjugate() * METRES_PER_PIXEL
+
+    @property
+    def in_puzzle(self):
+        """The centroid where it belongs."""
+        pose = self.piece["puzzle_from_image"]
+        turned = cmath.exp(1j * pose["theta"]) * complex(*self.piece["centroid"])
+        return (turned + complex(pose["x"], pose["y"])).conjugate() * METRES_PER_PIXEL
+
+    @property
+    def turn(self):
+        """The rotation from the table to the puzzle, as a unit number."""
+        return cmath.exp(-1j * self.piece["puzzle_from_image"]["theta"])
+
+
+def planar(transform_or_pose):
+    """Position and heading of a transform or a pose that has to lie in the plane."""
+    position = getattr(transform_or_pose, "translation", None) or transform_or_pose.position
+    rotation = getattr(transform_or_pose, "rotation", None) or transform_or_pose.orientation
+    assert position.z == 0 and rotation.x == 0 and rotation.y == 0
+    assert abs(rotation.z**2 + rotation.w**2 - 1) < 1e-9
+    return complex(position.x, position.y), complex(rotation.w, rotation.z) ** 2
+
+
+class Arm:
+    """Reads /tf_static and the assembly, as a pick-and-place arm does, at whatever time it comes up."""
+
+    def __init__(self, ros, assembly="assembly", name="arm"):
+        self.ros = ros
+        self.node = ros.node(name)
+        self.assemblies = []
+        self.transforms = {}  # by child frame
+        qos = QoSProfile(
+            depth=1, reliability=QoSReliabilityPolicy.RELIABLE, durability=QoSDurabilityPolicy.TRANSIENT_LOCAL
+        )
+        self.node.create_subscription(Assembly, assembly, self.assemblies.append, qos)
+        self.node.create_subscription(TFMessage, "/tf_static", self.take, qos)
+
+    def take(self, message):
+        self.transforms.update((transform.child_frame_id, transform) for transform in message.transforms)
+
+    def complete(self, pieces, timeout=60):
+        """Waits for the complete assembly and its transforms; gives the assembly."""
+
+        def done():
+            latest = self.assemblies[-1] if self.assemblies else None
+            if latest is None or latest.state != Assembly.COMPLETE or len(latest.pieces) != pieces:
+                return None
+            return latest if all(f"piece_{piece.id}_goal" in self.transforms for piece in latest.pieces) else None
+
+        return self.ros.until(done, f"complete assembly of {pieces} pieces", timeout)
+
+    def frames(self, piece_id):
+        """The two frames of a piece: as it lies and as it belongs."""
+        return self.transforms[f"piece_{piece_id}"], self.transforms[f"piece_{piece_id}_goal"]
+
+
+def check_assembly(arm, truth, assembly, table="table", puzzle="puzzle"):
+    """Compares every motion of the arm with the truth."""
+    assert assembly.header.frame_id == puzzle
+    assert assembly.table_frame == table
+    assert {piece.id for piece in assembly.pieces} == set(truth)
+    assert not assembly.unplaced
+    goals = {}
+    for piece in assembly.pieces:
+        observed, goal = arm.frames(piece.id)
+        assert (observed.header.frame_id, goal.header.frame_id) == (table, puzzle)
+        assert planar(observed.transform) == pytest_approx(planar(piece.observed))
+        assert planar(goal.transform) == pytest_approx(planar(piece.goal))
+        assert piece.component == 0
+        assert 0 < piece.confidence <= 1
+
+        place, heading = planar(observed.transform)
+        assert heading == 1, "a piece's axes are those of its image"
+        assert abs(place - truth[piece.id].on_table) < SIGHTING_TOLERANCE_PX * METRES_PER_PIXEL
+        goals[piece.id] = planar(goal.transform)
+
+    # The cell may lay the puzzle down turned: one rigid motion of the whole is fitted first.
+    ids = sorted(goals)
+    found = numpy.array([goals[i][0] for i in ids])
+    true = numpy.array([truth[i].in_puzzle for i in ids])
+    turn = numpy.vdot(true - true.mean(), found - found.mean())
+    turn /= abs(turn)
+    distance = abs(found - found.mean() - turn * (true - true.mean()))
+    assert distance.max() < POSITION_TOLERANCE_PX * METRES_PER_PIXEL, distance / METRES_PER_PIXEL
+    for i in ids:
+        error = abs(cmath.phase(goals[i][1] / (turn * truth[i].turn)))
+        assert error < ANGLE_TOLERANCE, f"{i} is turned by {error} rad"
+
+    # A puzzle with straight sides has its corner in the origin: the pieces lie to the right of it and above.
+    assert found.real.min() > 0 and found.imag.min() > 0
+
+    # Every mating is one of two true neighbours.
+    neighbours = {
+        frozenset((piece["id"], side["neighbour"]))
+        for piece in (known.piece for known in truth.values())
+        for side in piece["sides"]
+        if side["neighbour"]
+    }
+    name = {i: known.piece["id"] for i, known in truth.items()}
+    mated = {frozenset((name[m.positive_piece], name[m.negative_piece])) for m in assembly.matings}
+    assert mated <= neighbours
+    assert len(mated) >= len(truth) - 1
+
+
+def pytest_approx(pair):
+    """The position to a nanometre, the heading to a nanoradian: the same pose told twice."""
+    import pytest
+
+    return pytest.approx(pair, abs=1e-9)

@@ -1,0 +1,45 @@
+"""A second DDS: CycloneDDS, by its own Python binding, reads what the cell latches."""
+
+import pytest
+from jigsaw_msgs.msg import Assembly
+from rosbags.typesys import get_types_from_msg
+
+from bench import METRES_PER_PIXEL, Camera, check_assembly
+from conftest import LATCHED
+from cyclone import Cyclone, idl_type
+
+TIMEOUT = 30.0  # seconds
+
+
+class CycloneArm:
+    """As `bench.Arm`, on CycloneDDS."""
+
+    def __init__(self, domain, transcode):
+        cyclone = Cyclone(domain)
+
+        def latched(topic, full_name):
+            definition = transcode.ask(full_name)["definition"]
+            return cyclone.first(topic, idl_type(full_name, get_types_from_msg(definition, full_name)), TIMEOUT)
+
+        self.assembly = latched("/assembly", "jigsaw_msgs/msg/Assembly")
+        transforms = latched("/tf_static", "tf2_msgs/msg/TFMessage").transforms
+        self.transforms = {transform.child_frame_id: transform for transform in transforms}
+
+    def frames(self, piece_id):
+        return self.transforms[f"piece_{piece_id}"], self.transforms[f"piece_{piece_id}_goal"]
+
+
+def test_assembly_and_transforms_of_a_late_joiner(launcher, ros, domain, generate, transcode):
+    launcher.cell("-p", f"capture_node:metres_per_pixel:={METRES_PER_PIXEL}")
+    truth = Camera(ros).show_puzzle(generate(2, 3, 5))
+    latest = []
+    node = ros.node("watcher")
+    node.create_subscription(Assembly, "assembly", latest.append, LATCHED)
+    ros.until(lambda: latest and latest[-1].state == Assembly.COMPLETE and len(latest[-1].pieces) == 6, "assembly")
+
+    arm = CycloneArm(domain, transcode)
+    assert arm.assembly.state == Assembly.COMPLETE
+    assert [piece.id for piece in arm.assembly.pieces] == [piece.id for piece in latest[-1].pieces]
+    assert arm.assembly.table.pairs == latest[-1].table.pairs
+    assert arm.assembly.matings[0].correlation == pytest.approx(latest[-1].matings[0].correlation)
+    check_assembly(arm, truth, arm.assembly)
