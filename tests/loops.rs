@@ -1,5 +1,7 @@
 //! The loops of the three nodes over vectors, without any middleware: frames in, poses out, against the truth.
 
+#![allow(clippy::unwrap_used, reason = "a test fails by panicking")]
+
 use std::sync::Arc;
 
 use futures::channel::{mpsc, oneshot};

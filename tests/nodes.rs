@@ -1,5 +1,7 @@
 //! The three real binaries over loopback DDS: a folder of pictures in, the assembly and the poses out.
 
+#![allow(clippy::unwrap_used, reason = "a test fails by panicking")]
+
 use std::io::Read;
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, ExitStatus, Stdio};

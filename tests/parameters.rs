@@ -3,6 +3,8 @@
 //! `UPDATE_PARAMETER_FILES=1 cargo test --test parameters` writes the files anew; with `--
 //! --nocapture` the tables for the README are printed.
 
+#![allow(clippy::unwrap_used, reason = "a test fails by panicking")]
+
 use std::path::Path;
 
 use jigsaw_nodes::ros::params::{Spec, markdown, show, yaml};

@@ -183,8 +183,8 @@ fn reread(folder: &std::path::Path, again: &mpsc::UnboundedSender<Frame>) -> Tri
     match source::pictures(folder) {
         Ok(files) => {
             let message = format!("{} pictures of {} are read again", files.len(), folder.display());
-            let sent = files.into_iter().try_for_each(|file| again.unbounded_send(Frame::File(file)));
-            TriggerResponse { success: sent.is_ok(), message }
+            let sent = files.into_iter().all(|file| again.unbounded_send(Frame::File(file)).is_ok());
+            TriggerResponse { success: sent, message }
         }
         Err(e) => TriggerResponse { success: false, message: e.to_string() },
     }
