@@ -37,6 +37,8 @@ const MIN_AGREE: Tolerance = Tolerance { position: 0.015, angle: 0.02 };
 /// piece leave a tenth of the noise of one.
 const COARSE: f64 = 0.05;
 const FINE: f64 = 0.02;
+/// An assembly of so many pieces is the puzzle; a pair beside it is not.
+const LARGE: usize = 8;
 /// Adjustments at the end: two bring the poses to a tenth of what the border's noise leaves.
 const FINAL_ROUNDS: usize = 2;
 /// Candidates of each mouth (and tab) that take part in loops: more and chance loops drown the true ones.
@@ -918,6 +920,10 @@ impl Assembler<'_> {
         } else {
             (0..self.edges.len()).filter(|k| self.same_island(*k) && self.agrees(*k)).collect()
         };
+        // Two pieces beside a large assembly: a single joint that nothing confirms, such as two that lie face down.
+        let largest = self.state.members.iter().map(Vec::len).max().unwrap_or(0);
+        let least = if !paper && largest >= LARGE { 2 } else { 1 };
+        order.retain(|k| self.state.members[self.state.island[self.edges[*k].a]].len() > least);
         order.sort_by(|p, q| joints[*p].fit.residual.total_cmp(&joints[*q].fit.residual).then(p.cmp(q)));
         // Contacts that agree with a piece's pose: each beyond the first confirms it.
         let mut evidence = vec![0.0f64; n];
@@ -947,7 +953,7 @@ impl Assembler<'_> {
             poses: (0..n)
                 .map(|k| {
                     let island = self.state.island[k];
-                    (self.state.members[island].len() > 1).then(|| (island, self.state.pose[k]))
+                    (self.state.members[island].len() > least).then(|| (island, self.state.pose[k]))
                 })
                 .collect(),
             support: self.edges.iter().map(|e| e.support).collect(),
