@@ -10,3 +10,4 @@ pub mod cell;
 pub mod feature;
 pub mod ros;
 pub mod solver;
+pub mod watch;

@@ -16,10 +16,12 @@ struct Cli {
 enum Command {
     #[command(subcommand)]
     Bag(BagCommand),
+    Watch(jigsaw_nodes::watch::WatchArgs),
 }
 
 fn main() -> ExitCode {
     match Cli::parse().command {
         Command::Bag(command) => jigsaw_nodes::bag::cli::run(command),
+        Command::Watch(args) => jigsaw_nodes::watch::run(args),
     }
 }
