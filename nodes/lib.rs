@@ -7,7 +7,10 @@
 pub mod bag;
 pub mod capture;
 pub mod cell;
+pub mod cli;
 pub mod feature;
+pub mod offline;
+pub mod picture;
 pub mod ros;
 pub mod solver;
 pub mod watch;

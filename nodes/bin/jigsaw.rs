@@ -1,27 +1,5 @@
-//! jigsaw
+//! The command line `jigsaw`; see `jigsaw --help`.
 
-use std::process::ExitCode;
-
-use clap::{Parser, Subcommand};
-use jigsaw_nodes::bag::cli::BagCommand;
-
-#[derive(Parser)]
-#[command(version)]
-struct Cli {
-    #[command(subcommand)]
-    command: Command,
-}
-
-#[derive(Subcommand)]
-enum Command {
-    #[command(subcommand)]
-    Bag(BagCommand),
-    Watch(jigsaw_nodes::watch::WatchArgs),
-}
-
-fn main() -> ExitCode {
-    match Cli::parse().command {
-        Command::Bag(command) => jigsaw_nodes::bag::cli::run(command),
-        Command::Watch(args) => jigsaw_nodes::watch::run(args),
-    }
+fn main() -> std::process::ExitCode {
+    jigsaw_nodes::cli::run(std::env::args_os())
 }

@@ -26,7 +26,8 @@ impl FrameName {
         }
     }
 
-    fn base(&self) -> String {
+    /// Name of the frame's only piece; several get a number more.
+    pub fn base(&self) -> String {
         match self {
             Self::File(name) => plain(stem(name)),
             Self::Stamp(_, sec, nanosec) => plain(&format!("{sec}_{nanosec:09}")),

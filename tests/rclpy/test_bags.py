@@ -131,9 +131,9 @@ def test_topics_of_any_type_are_recorded_from_rclpy(launcher, ros, tmp_path):
 @pytest.mark.parametrize("name", ["puzzle24", "puzzle6"])
 def test_bags_of_the_project_open_elsewhere(name):
     folder = ROOT / "bags" / name
-    pieces = {piece["source"] for piece in json.loads((folder / "truth.json").read_text())["pieces"]}
+    frames = {piece["frame"] for piece in json.loads((folder / "truth.json").read_text())["pieces"]}
     raw = read_with_rosbags(folder)
-    assert len(raw) == len(pieces)
+    assert len(raw) == len(frames)
     decoded = read_with_mcap_ros2(folder / f"{name}_0.mcap")
     for (topic, message), (_, msgtype, cdr) in zip(decoded, raw, strict=True):
         assert (topic, msgtype, message.header.frame_id) == (TOPIC, TYPE, "camera")

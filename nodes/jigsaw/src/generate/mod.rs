@@ -41,7 +41,7 @@ use rand_chacha::rand_core::SeedableRng;
 
 use cut::Sheet;
 pub use render::Frame;
-pub use truth::{JointTruth, PieceTruth, PoseTruth, Score, SideTruth, Truth};
+pub use truth::{FrameLabel, JointTruth, PieceTruth, PoseTruth, Score, SideTruth, Truth};
 
 /// How the sheet is divided.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, serde::Serialize, serde::Deserialize)]

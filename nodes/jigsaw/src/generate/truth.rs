@@ -25,8 +25,10 @@ pub struct Truth {
 pub struct PieceTruth {
     /// `<file stem>`, or `<file stem>_<k>` in reading order where a frame holds more than one.
     pub id: String,
-    /// File name of its frame.
+    /// File name of its frame, or the topic of the frames of a bag.
     pub source: String,
+    /// Number of its frame, from 0 in the order of the files or messages.
+    pub frame: usize,
     /// Which puzzle of the heap it belongs to.
     pub puzzle: usize,
     /// Row in its puzzle.
@@ -45,6 +47,15 @@ pub struct PieceTruth {
     pub area_px: f64,
     /// Its sides, clockwise as seen in the image.
     pub sides: Vec<SideTruth>,
+}
+
+/// What a frame is called where it is written.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct FrameLabel {
+    /// Beginning of the ids of its pieces.
+    pub stem: String,
+    /// File name or topic.
+    pub source: String,
 }
 
 /// A rigid motion, R = [[cos, -sin], [sin, cos]].
@@ -134,7 +145,20 @@ const REFERENCES: usize = 32;
 impl Puzzle {
     /// What `truth.json` says; `extension` is that of the frames' files.
     pub fn truth(&self, extension: &str) -> Truth {
-        let id = |k: usize| self.pieces()[k].id.clone();
+        self.truth_labelled(|frame| {
+            let stem = self.frame_stem(frame);
+            FrameLabel { source: format!("{stem}.{extension}"), stem }
+        })
+    }
+
+    /// What `truth.json` says where frames, and with them pieces, are called otherwise.
+    pub fn truth_labelled(&self, label: impl Fn(usize) -> FrameLabel) -> Truth {
+        let labels: Vec<FrameLabel> = (0..self.frame_count()).map(label).collect();
+        let id = |k: usize| {
+            let piece = &self.pieces()[k];
+            let number = piece.id.strip_prefix(&self.frame_stem(piece.frame)).unwrap_or_default();
+            format!("{}{number}", labels[piece.frame].stem)
+        };
         let pieces = (0..self.pieces().len())
             .map(|k| {
                 let piece = &self.pieces()[k];
@@ -157,8 +181,9 @@ impl Puzzle {
                     })
                     .collect();
                 PieceTruth {
-                    id: piece.id.clone(),
-                    source: format!("{}.{extension}", self.frame_stem(piece.frame)),
+                    id: id(k),
+                    source: labels[piece.frame].source.clone(),
+                    frame: piece.frame,
                     puzzle: piece.puzzle,
                     row: piece.row,
                     column: piece.column,
