@@ -1,13 +1,14 @@
 //! How well the solver does on generated puzzles: one line for each case and seed.
 //!
-//! `cargo run --release -p jigsaw --example evaluate -- [CASE…] [--seeds FROM..TO] [--off SWITCH]`
+//! `cargo run --release -p jigsaw --example evaluate -- [CASE…] [--seeds FROM..TO] [--off SWITCH] [--paper] [--verbose]`
 //! where a case is one of those listed by `--list`, and a switch is one of loops, pose_graph, fit_clearance,
 //! recalibrate, merge_islands.
 
 use anyhow::{Context, bail};
-use isthmus::mask;
+use isthmus::{Point, mask};
 use jigsaw::generate::{Cut, Options, Puzzle, Rim};
 use jigsaw::{Params, Piece, Policy, Solver};
+use nalgebra::Vector2;
 use rayon::prelude::*;
 use std::time::Instant;
 
@@ -80,9 +81,16 @@ fn pieces(puzzle: &Puzzle, frames: bool) -> anyhow::Result<Vec<Piece>> {
         .collect()
 }
 
+/// Middle of a piece's border points.
+fn centroid(piece: &Piece) -> Point {
+    let points = &piece.features.border.points;
+    Point::from(points.iter().fold(Vector2::zeros(), |s, p| s + p.coords) / points.len() as f64)
+}
+
 fn main() -> anyhow::Result<()> {
     let mut names = Vec::new();
     let mut seeds = 1..4u64;
+    let mut verbose = false;
     let mut params = Params::default();
     let mut arguments = std::env::args().skip(1);
     let cases = cases();
@@ -105,6 +113,7 @@ fn main() -> anyhow::Result<()> {
                 Some("merge_islands") => params.merge_islands = false,
                 other => bail!("unknown switch {other:?}"),
             },
+            "--verbose" => verbose = true,
             "--paper" => params.policy = Policy::Paper,
             name => names.push(name.to_owned()),
         }
@@ -157,6 +166,20 @@ fn main() -> anyhow::Result<()> {
             );
             if params.policy == Policy::Paper {
                 println!("{:?}", assembly.table);
+            }
+            if verbose && !s.is_perfect() {
+                let mut placements = assembly.placements.clone();
+                placements.sort_by(|p, q| p.component.cmp(&q.component).then(p.piece.cmp(&q.piece)));
+                for p in &placements {
+                    let centre = p.puzzle_from_image * centroid(&pieces[p.piece]);
+                    println!(
+                        "  {} component {} at {:.0} {:.0} confidence {:.4}",
+                        pieces[p.piece].id, p.component, centre.x, centre.y, p.confidence
+                    );
+                }
+                for k in &assembly.unplaced {
+                    println!("  {} left over", pieces[*k].id);
+                }
             }
         }
     }

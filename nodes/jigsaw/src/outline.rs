@@ -74,6 +74,8 @@ pub(crate) struct Raster {
     pub(crate) distance: Vec<f32>,
     /// Index of the nearest border point.
     pub(crate) nearest: Vec<u32>,
+    /// The cell centre farthest inside.
+    pub(crate) pole: Point,
 }
 
 /// A piece made ready.
@@ -124,7 +126,7 @@ impl Outline {
             .collect();
         let radius = points.iter().map(|p| (p - centroid).norm()).fold(0.0, f64::max);
         let mut outline = Self {
-            raster: Raster::new(&points, &normals, area.sqrt() / RASTER_CELLS),
+            raster: Raster::new(&points, area.sqrt() / RASTER_CELLS),
             hull: convex_hull(points.clone()),
             points,
             normals,
@@ -303,7 +305,7 @@ fn keys(shape: &[f32; SHAPE_SAMPLES]) -> [f32; KEYS] {
 
 impl Raster {
     /// Two sweeps of nearest-point propagation (Danielsson), exact enough at this coarseness.
-    fn new(points: &[Point], normals: &[Vector2<f32>], cell: f64) -> Self {
+    fn new(points: &[Point], cell: f64) -> Self {
         let cell = cell.max(1e-6);
         let (mut low, mut high) = (points[0], points[0]);
         for p in points {
@@ -363,17 +365,32 @@ impl Raster {
                 relax(c, r, -1, 0);
             }
         }
-        let mut distance = vec![0f32; columns * rows];
-        for r in 0..rows {
-            for c in 0..columns {
-                let k = r * columns + c;
-                let i = nearest[k] as usize;
-                let d = centre(c, r) - points[i];
-                let side = d.x * f64::from(normals[i].x) + d.y * f64::from(normals[i].y);
-                distance[k] = d.norm().copysign(side) as f32;
+        // Which side a cell lies on is counted, not told from the nearest normal: beyond a corner that is ambiguous.
+        let mut crossings: Vec<Vec<f64>> = vec![Vec::new(); rows];
+        for (i, a) in points.iter().enumerate() {
+            let b = points[(i + 1) % points.len()];
+            let row = |y: f64| ((y - origin.y) / cell - 0.5).ceil().max(0.0) as usize;
+            for (r, list) in crossings.iter_mut().enumerate().take(row(a.y.max(b.y))).skip(row(a.y.min(b.y))) {
+                list.push(a.x + (b.x - a.x) * ((centre(0, r).y - a.y) / (b.y - a.y)));
             }
         }
-        Self { origin, cell, columns, rows, distance, nearest }
+        let mut distance = vec![0f32; columns * rows];
+        for (r, list) in crossings.iter_mut().enumerate() {
+            list.sort_by(f64::total_cmp);
+            let mut passed = 0;
+            for c in 0..columns {
+                let k = r * columns + c;
+                let p = centre(c, r);
+                while list.get(passed).is_some_and(|x| *x < p.x) {
+                    passed += 1;
+                }
+                let d = (p - points[nearest[k] as usize]).norm() as f32;
+                distance[k] = if passed % 2 == 1 { -d } else { d };
+            }
+        }
+        let deepest = (0..distance.len()).min_by(|i, j| distance[*i].total_cmp(&distance[*j])).unwrap_or(0);
+        let pole = centre(deepest % columns, deepest / columns);
+        Self { origin, cell, columns, rows, distance, nearest, pole }
     }
 
     /// Cell that holds a point.
@@ -413,11 +430,23 @@ fn intrusion(a: &Outline, b: &Outline, b_from_a: &Isometry2<f64>) -> f64 {
     sum * stride as f64 * a.spacing
 }
 
+/// Whether the innermost point of `a` lies deep inside `b`.
+fn swallows(b: &Outline, a: &Outline, b_from_a: &Isometry2<f64>) -> bool {
+    /// Depth in piece scales: abutting pieces keep their innermost points this far and farther outside.
+    const DEEP: f64 = 0.1;
+    let pole = b_from_a * a.raster.pole;
+    b.raster.cell_of(pole).is_some_and(|cell| f64::from(b.raster.distance[cell]) < -DEEP * b.scale)
+}
+
 /// Area in which two pieces overlap, in square pixels: exact for shallow overlaps, large for deep ones.
 pub(crate) fn overlap_area(a: &Outline, b: &Outline, b_from_a: &Isometry2<f64>) -> f64 {
     let centre = b_from_a * a.centroid;
     if (centre - b.centroid).norm() > a.radius + b.radius {
         return 0.0;
+    }
+    // Copies that lie on one another intrude nowhere: their borders coincide.
+    if swallows(b, a, b_from_a) {
+        return a.area.min(b.area);
     }
     intrusion(a, b, b_from_a).max(intrusion(b, a, &b_from_a.inverse()))
 }

@@ -37,14 +37,18 @@ const MIN_AGREE: Tolerance = Tolerance { position: 0.015, angle: 0.02 };
 /// piece leave a tenth of the noise of one.
 const COARSE: f64 = 0.05;
 const FINE: f64 = 0.02;
-/// An assembly of so many pieces is the puzzle; a pair beside it is not.
-const LARGE: usize = 8;
+/// An island of at most so many pieces is stray if the largest is this many times as large: pieces that lie face down
+/// or twice may well mate with one another, but where they belong is taken. Halves of mixed puzzles are larger.
+const STRAY: usize = 5;
+const STRAY_SHARE: usize = 4;
 /// Adjustments at the end: two bring the poses to a tenth of what the border's noise leaves.
 const FINAL_ROUNDS: usize = 2;
 /// Candidates of each mouth (and tab) that take part in loops: more and chance loops drown the true ones.
 const LOOP_RANKS: usize = 6;
 /// Candidates of each mouth and tab that take part in growth.
 const GROWTH_RANKS: usize = 12;
+/// Rounds of verification and growth at most: a contradiction that comes back each time stays out.
+const REGROWTHS: usize = 3;
 /// Contact of outlines is looked for within this distance, in piece scales.
 const CONTACT_BAND: f64 = 0.035;
 
@@ -236,7 +240,14 @@ impl Assembler<'_> {
         self.learn(&trusted);
         self.refine_all(1, COARSE);
         self.grow();
-        self.verify();
+        // What was taken out leaves room for what it kept out.
+        for _ in 0..REGROWTHS {
+            if !self.verify() {
+                break;
+            }
+            self.grow();
+        }
+        self.reconcile();
         self.improve();
         self.refine_all(FINAL_ROUNDS, FINE);
         self.finish(joints)
@@ -475,6 +486,16 @@ impl Assembler<'_> {
 
     /// Joins two islands in the pose that suits all of several candidates best.
     fn join_by_all(&mut self, members: &[usize]) -> bool {
+        let (ia, ib, pose) = self.common_pose(members);
+        if ia == ib || !self.merge(ia, ib, &pose) {
+            return false;
+        }
+        self.take(members[0]);
+        true
+    }
+
+    /// The islands that some candidates would join, and the pose of the first in the second that suits them best.
+    fn common_pose(&self, members: &[usize]) -> (usize, usize, Isometry2<f64>) {
         let first = &self.edges[members[0]];
         let (ia, ib) = (self.state.island[first.a], self.state.island[first.b]);
         let (mut here, mut there) = (Vec::new(), Vec::new());
@@ -489,12 +510,7 @@ impl Assembler<'_> {
                 there.push(if forward { in_b } else { in_a });
             }
         }
-        let pose = placement::rigid_fit(&here, &there);
-        if !self.merge(ia, ib, &pose) {
-            return false;
-        }
-        self.take(members[0]);
-        true
+        (ia, ib, placement::rigid_fit(&here, &there))
     }
 
     /// Where a piece's centroid lies in its island.
@@ -781,7 +797,9 @@ impl Assembler<'_> {
     }
 
     /// Takes out pieces that overlap others, the less supported one of a pair; islands that fall apart are split.
-    fn verify(&mut self) {
+    /// Tells whether anything was taken out.
+    fn verify(&mut self) -> bool {
+        let mut changed = false;
         for _ in 0..4 {
             let mut evict: Vec<usize> = Vec::new();
             let joined = self.joined_at();
@@ -801,11 +819,13 @@ impl Assembler<'_> {
             // Matings that the adjusted poses contradict hold nothing.
             let broken: Vec<usize> = self.state.joined.iter().copied().filter(|k| !self.agrees(*k)).collect();
             if evict.is_empty() && broken.is_empty() {
-                return;
+                break;
             }
+            changed = true;
             self.detach(&evict, &broken);
             self.refine_all(1, COARSE);
         }
+        changed
     }
 
     /// Joined candidates at each piece.
@@ -856,6 +876,76 @@ impl Assembler<'_> {
                 self.state.members[root] = part;
             }
         }
+    }
+
+    /// Islands that fit together but for a few pieces of one that lie where pieces of the other lie already (copies, or
+    /// wrong ones): those are taken out, unless that is worth less than before.
+    fn reconcile(&mut self) {
+        if !self.params.merge_islands {
+            return;
+        }
+        let mut tried = std::collections::HashSet::new();
+        loop {
+            let mut hypotheses = self.hypotheses();
+            hypotheses.retain(|(_, group)| {
+                let e = &self.edges[group[0]];
+                let size = |p: usize| self.state.members[self.state.island[p]].len();
+                size(e.a).min(size(e.b)) > 1 && !tried.contains(group)
+            });
+            hypotheses.sort_by(|p, q| q.0.total_cmp(&p.0).then_with(|| p.1.cmp(&q.1)));
+            let Some((_, group)) = hypotheses.into_iter().next() else { return };
+            if self.backtracks >= self.params.backtracks || self.late() {
+                return;
+            }
+            let saved = self.state.clone();
+            let before = self.worth();
+            let losers = self.losers(&group);
+            self.detach(&losers, &[]);
+            if losers.is_empty() || !self.join_by_all(&group) {
+                self.state = saved;
+                tried.insert(group);
+                continue;
+            }
+            for k in &group[1..] {
+                if self.admissible(*k) {
+                    self.take(*k);
+                }
+            }
+            self.refine_all(1, COARSE);
+            self.grow();
+            self.verify();
+            if self.worth() <= before + 1e-9 {
+                self.state = saved;
+                self.backtracks += 1;
+            }
+            tried.insert(group);
+        }
+    }
+
+    /// The pieces, of two islands that some candidates would join, that lie on others and have less evidence than
+    /// those; none if they are too many to be exceptions.
+    fn losers(&self, group: &[usize]) -> Vec<usize> {
+        /// At most one piece in this many of the smaller island may have to go.
+        const EXCEPTIONS: usize = 4;
+        let (ia, ib, pose) = self.common_pose(group);
+        let joined = self.joined_at();
+        let weight =
+            |k: usize| joined[k].iter().map(|j| AGREEMENT + self.model.evidence(self.edges[*j].cost)).sum::<f64>();
+        let mut losers = Vec::new();
+        for &p in &self.state.members[ia] {
+            let here = pose * self.state.pose[p];
+            for &q in &self.state.members[ib] {
+                let q_from_p = self.state.pose[q].inverse() * here;
+                let area = overlap_area(self.outlines[p], self.outlines[q], &q_from_p);
+                if area > self.tolerated() * self.outlines[p].scale * self.outlines[q].scale {
+                    losers.push(if weight(p) < weight(q) { p } else { q });
+                }
+            }
+        }
+        losers.sort_unstable();
+        losers.dedup();
+        let smaller = self.state.members[ia].len().min(self.state.members[ib].len());
+        if losers.len() * EXCEPTIONS > smaller { Vec::new() } else { losers }
     }
 
     /// What the assembly is worth: the evidence of its matings.
@@ -920,10 +1010,9 @@ impl Assembler<'_> {
         } else {
             (0..self.edges.len()).filter(|k| self.same_island(*k) && self.agrees(*k)).collect()
         };
-        // Two pieces beside a large assembly: a single joint that nothing confirms, such as two that lie face down.
         let largest = self.state.members.iter().map(Vec::len).max().unwrap_or(0);
-        let least = if !paper && largest >= LARGE { 2 } else { 1 };
-        order.retain(|k| self.state.members[self.state.island[self.edges[*k].a]].len() > least);
+        let stray = if paper { 1 } else { (largest / STRAY_SHARE).clamp(1, STRAY) };
+        order.retain(|k| self.state.members[self.state.island[self.edges[*k].a]].len() > stray);
         order.sort_by(|p, q| joints[*p].fit.residual.total_cmp(&joints[*q].fit.residual).then(p.cmp(q)));
         // Contacts that agree with a piece's pose: each beyond the first confirms it.
         let mut evidence = vec![0.0f64; n];
@@ -953,7 +1042,7 @@ impl Assembler<'_> {
             poses: (0..n)
                 .map(|k| {
                     let island = self.state.island[k];
-                    (self.state.members[island].len() > least).then(|| (island, self.state.pose[k]))
+                    (self.state.members[island].len() > stray).then(|| (island, self.state.pose[k]))
                 })
                 .collect(),
             support: self.edges.iter().map(|e| e.support).collect(),
