@@ -24,7 +24,7 @@
 use crate::Point;
 use crate::contour::Border;
 use crate::skeleton::{NO_NEIGHBOUR, Triangulation};
-use nalgebra::{Matrix6, Vector2, Vector6};
+use nalgebra::Vector2;
 
 /// On which side of the border an isthmus line runs.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
@@ -98,9 +98,10 @@ struct Passage {
 /// a border point across the border, in pixels.
 #[must_use]
 pub fn find(border: &Border, triangulation: &Triangulation, noise: f64) -> Vec<Isthmus> {
+    let area = border.area();
     let mut found: Vec<Isthmus> = persistent_saddles(border, triangulation, noise)
         .into_iter()
-        .filter_map(|(side, persistence)| isthmus_at(border, triangulation, side, persistence, noise))
+        .filter_map(|saddle| isthmus_at(border, area, triangulation, saddle, noise))
         .collect();
     found.sort_by(|a, b| {
         b.salient.cmp(&a.salient).then(b.persistence.total_cmp(&a.persistence)).then(a.arc[0].total_cmp(&b.arc[0]))
@@ -110,7 +111,6 @@ pub fn find(border: &Border, triangulation: &Triangulation, noise: f64) -> Vec<I
 
 /// The sides of the triangulation that are isthmuses, with their persistence.
 fn persistent_saddles(border: &Border, triangulation: &Triangulation, noise: f64) -> Vec<(usize, f64)> {
-    let n = border.points.len();
     let outside = triangulation.discs.len();
     // Discs on (nearly) straight parts of the border have any radius, and rounding differs from one to the next: all that
     // are larger than the shape count as equally wide.
@@ -121,7 +121,7 @@ fn persistent_saddles(border: &Border, triangulation: &Triangulation, noise: f64
         if neighbour != NO_NEIGHBOUR && neighbour < side {
             continue;
         }
-        if triangulation.is_passage(side, n) {
+        if triangulation.is_passage(side) {
             passages.push(Passage { radius: passage_radius(border, triangulation, side).min(cap), side });
         }
     }
@@ -149,7 +149,7 @@ fn passage_radius(border: &Border, triangulation: &Triangulation, side: usize) -
     let (p, q) = (border.points[i], border.points[j]);
     let blocked = |side: usize| {
         // The third corner within the diametral disc: the edge does not cross its Voronoi edge.
-        let third = border.points[triangulation.corners[Triangulation::next_side(Triangulation::next_side(side))]];
+        let third = border.points[triangulation.ends(Triangulation::next_side(side))[1]];
         (p - third).dot(&(q - third)) < 0.0
     };
     let neighbour = triangulation.neighbours[side];
@@ -196,9 +196,9 @@ impl Regions {
 /// The isthmus whose chord is near a side of the triangulation.
 fn isthmus_at(
     border: &Border,
+    area: f64,
     triangulation: &Triangulation,
-    side: usize,
-    persistence: f64,
+    (side, persistence): (usize, f64),
     noise: f64,
 ) -> Option<Isthmus> {
     let polarity = triangulation.polarity[side / 3];
@@ -208,7 +208,6 @@ fn isthmus_at(
     let (s, t) = (s.rem_euclid(length), t.rem_euclid(length));
     let (p, q) = (border.point_at(s), border.point_at(t));
     let lobe = lobe_area(border, [s, t]);
-    let area = border.area();
     let forward = match polarity {
         Polarity::Positive => border.forward(s, t) <= border.forward(t, s),
         // Border and chord run round a pocket the other way than round the shape.
@@ -274,19 +273,31 @@ fn refine(border: &Border, [i, j]: [usize; 2], noise: f64) -> [f64; 2] {
     let start = [i as f64 * border.spacing, j as f64 * border.spacing];
     let apart = i.abs_diff(j).min(border.points.len() - i.abs_diff(j));
     let reach = (MIN_FIT + FIT_PER_NOISE * noise).min(MAX_FIT).min(apart as f64 / 3.0).round() as isize;
-    let mut normal = Matrix6::zeros();
-    let mut right = Vector6::zeros();
+    // On a symmetric grid 1, u, v, uv and the squares less their mean are orthogonal: each coefficient is one quotient.
+    let count = (2 * reach + 1) as f64;
+    let square = |a: isize| (a * a) as f64;
+    let mean = (-reach..=reach).map(square).sum::<f64>() / count;
+    let spread = (-reach..=reach).map(|a| (square(a) - mean).powi(2)).sum::<f64>();
+    let (mut fu, mut fv, mut fuu, mut fuv, mut fvv) = (0.0, 0.0, 0.0, 0.0, 0.0);
     for a in -reach..=reach {
+        let p = at(i as isize + a);
+        let (mut sum, mut first, mut second) = (0.0, 0.0, 0.0);
         for b in -reach..=reach {
-            let (u, v) = (a as f64, b as f64);
-            let row = Vector6::new(1.0, u, v, u * u, u * v, v * v);
-            let value = (at(i as isize + a) - at(j as isize + b)).norm_squared();
-            normal += row * row.transpose();
-            right += row * value;
+            let value = (p - at(j as isize + b)).norm_squared();
+            sum += value;
+            first += value * b as f64;
+            second += value * (square(b) - mean);
         }
+        fu += sum * a as f64;
+        fuu += sum * (square(a) - mean);
+        fv += first;
+        fuv += first * a as f64;
+        fvv += second;
     }
-    let Some(fit) = normal.cholesky().map(|c| c.solve(&right)) else { return start };
-    let (fu, fv, fuu, fuv, fvv) = (fit[1], fit[2], 2.0 * fit[3], fit[4], 2.0 * fit[5]);
+    let squares = mean * count;
+    (fu, fv) = (fu / (squares * count), fv / (squares * count));
+    (fuu, fvv) = (2.0 * fuu / (spread * count), 2.0 * fvv / (spread * count));
+    fuv /= squares * squares;
     let determinant = fuu * fvv - fuv * fuv;
     let shift = Vector2::new(fuv * fv - fvv * fu, fuv * fu - fuu * fv) / determinant;
     // Where the sides are parallel the fit has no minimum of its own, or one far away: then the shortest chord stays.

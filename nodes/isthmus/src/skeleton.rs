@@ -10,6 +10,10 @@
 //! A triangle whose corners, taken in the order of the border, turn the way the border turns lies inside, else outside:
 //! exact wherever the border's own steps are edges of the triangulation, and a matter of three indices.
 //!
+//! Discs are wide where the border's parts are far apart, so every border point is not needed there: the triangulation takes
+//! one point in several, a step of a hundredth of the shape's size, and halves the step as long as two parts of the border are
+//! within a few steps of each other.
+//!
 //! Every bump of the border grows a branch. What a branch adds to the shape is how far its last disc reaches beyond
 //! the disc where it leaves the others. Peeling the tree from its ends, branches that add less than the border's noise
 //! and spacing account for are pruned ([`Triangulation::skeleton`]); the others stay whole, up to their ends.
@@ -66,7 +70,9 @@ pub enum TriangulationError {
 /// Delaunay triangulation of a border's points, each triangle known as inside or outside the shape.
 #[derive(Debug, Clone, Default)]
 pub struct Triangulation {
-    /// Corners of the triangles, as indices into the border, three after three.
+    /// The border points that are triangulated, in the order of the border.
+    index: Vec<usize>,
+    /// Corners of the triangles, as indices into `index`, three after three.
     pub(crate) corners: Vec<usize>,
     /// For each side of each triangle (from its corner to the next) the same side of its neighbour, or [`NO_NEIGHBOUR`].
     pub(crate) neighbours: Vec<usize>,
@@ -89,6 +95,17 @@ const MIN_HEIGHT_NOISE: f64 = 8.0;
 /// of the box lie on it as a whole.
 pub const EXOSKELETON_MARGIN: f64 = 0.1;
 
+/// Distance of the triangulated border points, as a part of the square root of the shape's area: a quarter of the radius of the
+/// tightest curves that the border keeps.
+const STEP: f64 = 0.01;
+/// Greatest number of border steps from one triangulated point to the next.
+const MAX_STRIDE: usize = 4;
+/// Where two parts of the border are nearer to each other than this many steps, the step is halved: a passage is then found to
+/// a twenty-fourth of a step.
+const CLOSE: f64 = 3.0;
+/// ... and the way between them along the border is this many times as long: nearer ones are the two sides of a corner.
+const DETOUR: f64 = 3.0;
+
 /// In place of a neighbouring side on the hull.
 pub(crate) const NO_NEIGHBOUR: usize = delaunator::EMPTY;
 
@@ -108,20 +125,33 @@ impl Triangulation {
     /// # Errors
     /// [`TriangulationError`] where the points lie on one line.
     pub fn rebuild(&mut self, border: &Border) -> Result<(), TriangulationError> {
-        let points = &border.points;
         self.extent = border.bounds().map_or(0.0, |[low, high]| (high - low).norm());
+        let mut stride = ((STEP * border.area().sqrt() / border.spacing).round() as usize).clamp(1, MAX_STRIDE);
+        self.triangulate(border, stride)?;
+        while stride > 1 && !self.is_fine_enough(border, stride) {
+            stride /= 2;
+            self.triangulate(border, stride)?;
+        }
+        Ok(())
+    }
+
+    /// Triangulates one border point in `stride`.
+    fn triangulate(&mut self, border: &Border, stride: usize) -> Result<(), TriangulationError> {
+        let count = border.points.len() / stride;
+        self.index.clear();
+        self.index.extend((0..count).map(|k| k * border.points.len() / count));
         self.points.clear();
-        self.points.extend(points.iter().map(|p| delaunator::Point { x: p.x, y: p.y }));
+        self.points.extend(self.index.iter().map(|&k| border.points[k]).map(|p| delaunator::Point { x: p.x, y: p.y }));
         let delaunay = delaunator::triangulate(&self.points);
         self.corners = delaunay.triangles;
         self.neighbours = delaunay.halfedges;
         if self.corners.is_empty() {
-            return Err(TriangulationError::Degenerate { points: points.len() });
+            return Err(TriangulationError::Degenerate { points: border.points.len() });
         }
         self.discs.clear();
         self.polarity.clear();
         for t in self.corners.chunks_exact(3) {
-            let [a, b, c] = [points[t[0]], points[t[1]], points[t[2]]];
+            let [a, b, c] = [t[0], t[1], t[2]].map(|k| border.points[self.index[k]]);
             let (ab, ac) = (b - a, c - a);
             let twice_area = ab.perp(&ac);
             let (bb, cc) = (ab.norm_squared(), ac.norm_squared());
@@ -141,12 +171,35 @@ impl Triangulation {
         Ok(())
     }
 
+    /// Whether all steps of the border are sides of the triangulation, and no two parts of the border are close for its step.
+    fn is_fine_enough(&self, border: &Border, stride: usize) -> bool {
+        let step = stride as f64 * border.spacing;
+        let count = self.points.len();
+        let mut steps = 0;
+        for side in 0..self.corners.len() {
+            if self.neighbours[side] != NO_NEIGHBOUR && self.neighbours[side] < side {
+                continue;
+            }
+            let [i, j] = self.corner_pair(side);
+            let apart = i.abs_diff(j).min(count - i.abs_diff(j));
+            if apart == 1 {
+                steps += 1;
+                continue;
+            }
+            let chord = (border.points[self.index[i]] - border.points[self.index[j]]).norm();
+            if chord < CLOSE * step && apart as f64 * step > DETOUR * chord {
+                return false;
+            }
+        }
+        steps == count
+    }
+
     /// The skeleton on one side of the border, pruned by the standard deviation of its points across the border, `noise`. The
     /// exoskeleton is cut off [`EXOSKELETON_MARGIN`] beyond the bounding box.
     #[must_use]
     pub fn skeleton(&self, border: &Border, polarity: Polarity, noise: f64) -> Skeleton {
         let least = (MIN_HEIGHT_STEPS * border.spacing).max(MIN_HEIGHT_NOISE * noise);
-        let mut skeleton = self.chains(&self.peel(border, polarity, least));
+        let mut skeleton = self.chains(&self.peel(polarity, least));
         if let (Polarity::Negative, Some([low, high])) = (polarity, border.bounds()) {
             let margin = Vector2::repeat(EXOSKELETON_MARGIN * (high - low).amax());
             skeleton = skeleton.clipped(low - margin, high + margin);
@@ -155,14 +208,14 @@ impl Triangulation {
     }
 
     /// Whether a side is a way from one disc to the next, or a step of the border itself (or crosses it).
-    pub(crate) fn is_passage(&self, side: usize, border_points: usize) -> bool {
-        let [i, j] = self.ends(side);
+    pub(crate) fn is_passage(&self, side: usize) -> bool {
+        let [i, j] = self.corner_pair(side);
         let step = i.abs_diff(j);
         let there = match self.neighbours[side] {
             NO_NEIGHBOUR => Polarity::Negative,
             neighbour => self.polarity[neighbour / 3],
         };
-        self.polarity[side / 3] == there && step != 1 && step != border_points - 1
+        self.polarity[side / 3] == there && step != 1 && step != self.points.len() - 1
     }
 
     /// The triangle beyond a side; `None` where the outer world begins: over the hull, and at discs larger than the shape,
@@ -173,12 +226,11 @@ impl Triangulation {
     }
 
     /// Prunes the skeleton; gives the skeleton's graph: for each triangle that stays, its neighbours that stay.
-    fn peel(&self, border: &Border, polarity: Polarity, least: f64) -> Graph {
-        let n = border.points.len();
+    fn peel(&self, polarity: Polarity, least: f64) -> Graph {
         let count = self.discs.len();
         let is_open = |side: usize| {
             let t = side / 3;
-            self.polarity[t] == polarity && self.discs[t].distance <= self.extent && self.is_passage(side, n)
+            self.polarity[t] == polarity && self.discs[t].distance <= self.extent && self.is_passage(side)
         };
         // Ways out of each triangle that are not yet peeled; the one over the hull, to infinity, never is.
         let mut degree: Vec<u8> = (0..count).map(|t| (3 * t..3 * t + 3).map(|s| u8::from(is_open(s))).sum()).collect();
@@ -211,14 +263,14 @@ impl Triangulation {
                 ends.push(next);
             }
         }
-        Graph { kept: stays, border_points: n }
+        Graph { kept: stays }
     }
 
     /// Walks the branches of a pruned skeleton.
     fn chains(&self, graph: &Graph) -> Skeleton {
         let ways = |t: usize| {
             (3 * t..3 * t + 3).filter_map(move |s| {
-                let open = self.is_passage(s, graph.border_points);
+                let open = self.is_passage(s);
                 let there = self.beyond(s);
                 (open && there.is_none_or(|t| graph.kept[t])).then_some((s, there))
             })
@@ -267,7 +319,7 @@ impl Triangulation {
     fn way_out(&self, side: usize) -> impl Iterator<Item = SkeletonPoint> {
         /// Points of the way; their steps grow, since far out the distance grows evenly.
         const STEPS: usize = 24;
-        let [i, j] = self.ends(side);
+        let [i, j] = self.corner_pair(side);
         let end = |i: usize| nalgebra::Point2::new(self.points[i].x, self.points[i].y);
         let (p, q) = (end(i), end(j));
         let middle = nalgebra::center(&p, &q);
@@ -288,8 +340,13 @@ impl Triangulation {
         if side % 3 == 2 { side - 2 } else { side + 1 }
     }
 
-    /// The border points that a side joins.
+    /// The border points that a side joins, as indices into the border.
     pub(crate) fn ends(&self, side: usize) -> [usize; 2] {
+        self.corner_pair(side).map(|k| self.index[k])
+    }
+
+    /// The corners that a side joins.
+    fn corner_pair(&self, side: usize) -> [usize; 2] {
         [self.corners[side], self.corners[Self::next_side(side)]]
     }
 }
@@ -297,7 +354,6 @@ impl Triangulation {
 /// The triangles that stay in a pruned skeleton.
 struct Graph {
     kept: Vec<bool>,
-    border_points: usize,
 }
 
 impl Skeleton {
