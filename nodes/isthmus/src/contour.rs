@@ -6,7 +6,7 @@
 //!    cell joins the shape where its mean lies on the shape's side (G. M. Nielson, B. Hamann, *The asymptotic
 //!    decider*, Visualization 1991). Of all closed contours the longest outer one is taken.
 //! 2. A picture that is too noisy or too sharp (one-bit, without grey levels at the edge) for linear interpolation is
-//!    blurred first: just enough, as the measured noise and edge slope ask for.
+//!    blurred first, near the contour: just enough, as the measured noise and edge slope ask for.
 //! 3. *Resampling* at equal steps of about one pixel of arc length.
 //! 4. *Smoothing* by a Gaussian along the border. Its width balances what is left of the measured noise against the
 //!    rounding of the tightest curves: a Gaussian of standard deviation `s` leaves `noise^2 / (2 sqrt(pi) s)` of the
@@ -268,7 +268,9 @@ impl Border {
     /// Index of the point before an arc length, the one after, and how far between them.
     fn locate(&self, arc: f64) -> (usize, usize, f64) {
         let n = self.points.len();
-        let position = (arc / self.spacing).rem_euclid(n as f64);
+        let position = arc / self.spacing;
+        let within = (0.0..n as f64).contains(&position);
+        let position = if within { position } else { position.rem_euclid(n as f64) };
         let i = (position as usize).min(n - 1);
         (i, if i + 1 == n { 0 } else { i + 1 }, position - i as f64)
     }
@@ -331,8 +333,8 @@ fn shoelace(points: &[Point]) -> f64 {
 #[derive(Debug, Clone, Default)]
 pub struct Tracer {
     padded: Vec<u8>,
-    blurred: Vec<f32>,
-    row_buffer: Vec<f32>,
+    band: Band,
+    spans: Vec<Span>,
     visited: Vec<bool>,
     contour: Vec<Point>,
     longest: Vec<Point>,
@@ -375,15 +377,21 @@ impl Tracer {
         let pixels = if margin == 0 { &cutout.pixels } else { &padded };
         let sense = if shape_level > ground_level { 1.0 } else { -1.0 };
 
-        let traced = self.trace_longest(&Raster { pixels, width, height, level, sense });
+        let raw = Raw { pixels, width };
+        self.spans.clear();
+        raw.spans(level, sense, &mut self.spans);
+        let traced = self.trace_longest(&Raster { picture: raw, width, height, level, sense });
         let slope = traced.as_ref().map_or(f64::from(contrast), |t| t.slope);
         let blur = needed_blur(f64::from(contrast), slope, f64::from(cutout.noise_level));
-        let traced = if blur > 0.0 {
-            let mut blurred = std::mem::take(&mut self.blurred);
-            gaussian_blur(pixels, width, height, blur, &mut self.row_buffer, &mut blurred);
-            fill_rim(&mut blurred, width, ground_level);
-            let traced = self.trace_longest(&Raster { pixels: &blurred, width, height, level, sense });
-            self.blurred = blurred;
+        let traced = if blur > 0.0 && traced.is_some() {
+            let mut band = std::mem::take(&mut self.band);
+            band.mark(&self.longest, width, height);
+            band.blur(pixels, blur, ground_level);
+            self.spans.clear();
+            band.spans(&mut self.spans);
+            let picture = Blurred { band: &band, raw };
+            let traced = self.trace_longest(&Raster { picture, width, height, level, sense });
+            self.band = band;
             traced
         } else {
             traced
@@ -402,18 +410,21 @@ impl Tracer {
         Ok((border, noise))
     }
 
-    /// Traces all contours and leaves the longest outer one in `self.longest`.
-    fn trace_longest<P: Grey>(&mut self, raster: &Raster<'_, P>) -> Option<Trace> {
+    /// Traces all contours that go up through `self.spans` and leaves the longest outer one in `self.longest`.
+    fn trace_longest<P: Picture>(&mut self, raster: &Raster<P>) -> Option<Trace> {
         let (width, height) = (raster.width, raster.height);
         self.visited.clear();
         self.visited.resize(width * height, false);
         self.longest.clear();
         let mut best = None;
-        for y in 1..height.saturating_sub(1) {
-            let row = &raster.pixels[y * width..(y + 1) * width];
-            let mut outside = true;
-            for (x, &p) in row.iter().enumerate() {
-                let inside = raster.is_inside(p);
+        for span in &self.spans {
+            let y = span.y;
+            if y == 0 || y + 1 >= height {
+                continue;
+            }
+            let mut outside = span.start == 0 || raster.value(span.start - 1, y) <= 0.0;
+            for x in span.start..span.end {
+                let inside = raster.value(x, y) > 0.0;
                 if inside && outside && !self.visited[y * width + x] && x > 0 {
                     let slope = raster.follow(x, y, &mut self.visited, &mut self.contour);
                     if self.contour.len() > self.longest.len() && shoelace(&self.contour) > 0.0 {
@@ -457,7 +468,10 @@ impl Tracer {
     fn measure_noise(&mut self, border: &Border) -> f64 {
         let p = &border.points;
         let n = p.len();
-        let at = |i: usize, steps: usize| p[(i + steps * NOISE_STEP) % n].coords;
+        let at = |i: usize, steps: usize| {
+            let k = i + steps * NOISE_STEP;
+            p[if k < n { k } else { k - n }].coords
+        };
         self.deviations.clear();
         self.deviations.extend((0..n).step_by(NOISE_STEP).map(|i| {
             let tangent = at(i, 4) - at(i, 0);
@@ -495,19 +509,6 @@ fn pad(cutout: &Cutout, level: f32, padded: &mut Vec<u8>) -> usize {
     MARGIN
 }
 
-/// Makes the outermost pixels ground.
-fn fill_rim(pixels: &mut [f32], width: usize, ground: f32) {
-    for (y, row) in pixels.chunks_exact_mut(width).enumerate() {
-        if y == 0 {
-            row.fill(ground);
-        }
-        row[0] = ground;
-        row[width - 1] = ground;
-    }
-    let last = pixels.len().saturating_sub(width);
-    pixels[last..].fill(ground);
-}
-
 /// Blur in pixels that a picture needs before its contour can be trusted.
 fn needed_blur(contrast: f64, slope: f64, noise: f64) -> f64 {
     let edge_blur = contrast / ((2.0 * std::f64::consts::PI).sqrt() * slope.max(f64::MIN_POSITIVE));
@@ -520,64 +521,201 @@ fn needed_blur(contrast: f64, slope: f64, noise: f64) -> f64 {
     if against_noise > 0.0 { against_noise.clamp(MIN_EDGE_BLUR, MAX_BLUR) } else { against_aliasing }
 }
 
-/// Separable Gaussian blur; the picture is continued by its outermost pixels.
-fn gaussian_blur(
-    pixels: &[u8],
+/// Pixels of one row.
+#[derive(Debug, Clone, Copy)]
+struct Span {
+    y: usize,
+    start: usize,
+    /// One past the last pixel.
+    end: usize,
+}
+
+/// Grey levels by place.
+trait Picture {
+    fn at(&self, x: usize, y: usize) -> f32;
+}
+
+/// The pixels as they are.
+#[derive(Clone, Copy)]
+struct Raw<'a> {
+    pixels: &'a [u8],
+    width: usize,
+}
+
+impl Picture for Raw<'_> {
+    fn at(&self, x: usize, y: usize) -> f32 {
+        f32::from(self.pixels[y * self.width + x])
+    }
+}
+
+impl Raw<'_> {
+    /// The stretches of rows that are not on one side of the level as a whole.
+    fn spans(&self, level: f32, sense: f32, spans: &mut Vec<Span>) {
+        /// Pixels that are looked at together: most of a row is uniform.
+        const CHUNK: usize = 32;
+        // Beyond the levels of a byte, one step further is as good as any.
+        let bright = sense > 0.0;
+        let bound = if bright { level.floor() } else { level.ceil() }.clamp(-1.0, 256.0) as i16;
+        for (y, row) in self.pixels.chunks_exact(self.width).enumerate() {
+            let mut before = 0;
+            for (k, chunk) in row.chunks(CHUNK).enumerate() {
+                let inside: u8 = if bright {
+                    chunk.iter().map(|&p| u8::from(i16::from(p) > bound)).sum()
+                } else {
+                    chunk.iter().map(|&p| u8::from(i16::from(p) < bound)).sum()
+                };
+                let all = if usize::from(inside) == chunk.len() { 2 } else { u8::from(inside > 0) };
+                if all == 1 || all != before {
+                    spans.push(Span { y, start: k * CHUNK, end: k * CHUNK + chunk.len() });
+                }
+                // After a mixed stretch the next one is looked at whatever it holds.
+                before = all;
+            }
+        }
+    }
+}
+
+/// The cells of a picture round a contour, blurred.
+#[derive(Debug, Clone, Default)]
+struct Band {
     width: usize,
     height: usize,
-    sigma: f64,
-    row_buffer: &mut Vec<f32>,
-    out: &mut Vec<f32>,
-) {
-    let reach = (KERNEL_EXTENT * sigma).ceil() as usize;
-    let mut kernel: Vec<f32> =
-        (0..=2 * reach).map(|i| (-(i as f64 - reach as f64).powi(2) / (2.0 * sigma * sigma)).exp() as f32).collect();
-    let total: f32 = kernel.iter().sum();
-    kernel.iter_mut().for_each(|k| *k /= total);
-    out.clear();
-    out.resize(width * height, 0.0);
-    let mut column = vec![0.0f32; width + 2 * reach];
-    row_buffer.clear();
-    row_buffer.resize(width, 0.0);
-    for (y, to) in out.chunks_exact_mut(width).enumerate() {
-        row_buffer.fill(0.0);
-        for (i, k) in kernel.iter().enumerate() {
-            let source = (y + i).saturating_sub(reach).min(height - 1);
-            for (sum, p) in row_buffer.iter_mut().zip(&pixels[source * width..]) {
-                *sum += k * f32::from(*p);
+    /// Cells in a row.
+    columns: usize,
+    /// For each cell where its levels begin, or [`OUTSIDE_BAND`].
+    cells: Vec<usize>,
+    levels: Vec<f32>,
+    across: Vec<f32>,
+    blurred: Vec<f32>,
+}
+
+/// Side of a cell in pixels: with its neighbours it covers what the greatest blur moves a contour by.
+const CELL: usize = 8;
+const OUTSIDE_BAND: usize = usize::MAX;
+
+impl Band {
+    /// Takes the cells that a contour goes through, and their neighbours.
+    fn mark(&mut self, contour: &[Point], width: usize, height: usize) {
+        (self.width, self.height) = (width, height);
+        self.columns = width.div_ceil(CELL);
+        let rows = height.div_ceil(CELL);
+        self.cells.clear();
+        self.cells.resize(self.columns * rows, OUTSIDE_BAND);
+        let mut last = OUTSIDE_BAND;
+        for p in contour {
+            let (column, row) = (p.x as usize / CELL, p.y as usize / CELL);
+            if std::mem::replace(&mut last, row * self.columns + column) == last {
+                continue;
+            }
+            let columns = column.saturating_sub(1)..self.columns.min(column + 2);
+            for row in row.saturating_sub(1)..rows.min(row + 2) {
+                self.cells[row * self.columns + columns.start..row * self.columns + columns.end].fill(0);
             }
         }
-        column[..reach].fill(row_buffer[0]);
-        column[reach..reach + width].copy_from_slice(row_buffer);
-        column[reach + width..].fill(row_buffer[width - 1]);
-        for (i, k) in kernel.iter().enumerate() {
-            for (sum, p) in to.iter_mut().zip(&column[i..]) {
-                *sum += k * p;
+        let mut count = 0;
+        for cell in self.cells.iter_mut().filter(|c| **c != OUTSIDE_BAND) {
+            *cell = count * CELL * CELL;
+            count += 1;
+        }
+        self.levels.clear();
+        self.levels.resize(count * CELL * CELL, 0.0);
+    }
+
+    /// Neighbouring cells of a row: the row, and the columns from the first to one past the last.
+    fn stretches(&self) -> impl Iterator<Item = (usize, std::ops::Range<usize>)> {
+        self.cells.chunks_exact(self.columns.max(1)).enumerate().flat_map(|(row, cells)| {
+            let mut from = 0;
+            std::iter::from_fn(move || {
+                let start = from + cells[from..].iter().position(|c| *c != OUTSIDE_BAND)?;
+                let count = cells[start..].iter().position(|c| *c == OUTSIDE_BAND);
+                from = count.map_or(cells.len(), |count| start + count);
+                Some((row, start..from))
+            })
+        })
+    }
+
+    fn spans(&self, spans: &mut Vec<Span>) {
+        for (row, columns) in self.stretches() {
+            let (start, end) = (columns.start * CELL, self.width.min(columns.end * CELL));
+            spans.extend((row * CELL..self.height.min((row + 1) * CELL)).map(|y| Span { y, start, end }));
+        }
+    }
+
+    /// Separable Gaussian blur of the cells; the picture is continued by its outermost pixels, which then become ground, so that
+    /// contours close within.
+    fn blur(&mut self, pixels: &[u8], sigma: f64, ground: f32) {
+        let reach = (KERNEL_EXTENT * sigma).ceil() as usize;
+        let mut kernel: Vec<f32> = (0..=2 * reach)
+            .map(|i| (-(i as f64 - reach as f64).powi(2) / (2.0 * sigma * sigma)).exp() as f32)
+            .collect();
+        let total: f32 = kernel.iter().sum();
+        kernel.iter_mut().for_each(|k| *k /= total);
+        let (width, height) = (self.width, self.height);
+        let (mut across, mut blurred) = (std::mem::take(&mut self.across), std::mem::take(&mut self.blurred));
+        let mut levels = std::mem::take(&mut self.levels);
+        for (row, columns) in self.stretches() {
+            let (start, end) = (columns.start * CELL, width.min(columns.end * CELL));
+            // Pixels that the kernel needs, and how many of them lie beyond the picture.
+            let (from, to) = (start.saturating_sub(reach), width.min(end + reach));
+            let before = (reach + from) - start;
+            for y in row * CELL..height.min((row + 1) * CELL) {
+                across.clear();
+                across.resize(end - start + 2 * reach, 0.0);
+                let within = before..before + to - from;
+                for (i, k) in kernel.iter().enumerate() {
+                    let source = (y + i).saturating_sub(reach).min(height - 1) * width;
+                    for (sum, p) in across[within.clone()].iter_mut().zip(&pixels[source + from..source + to]) {
+                        *sum += k * f32::from(*p);
+                    }
+                }
+                let (first, last) = (across[within.start], across[within.end - 1]);
+                across[..within.start].fill(first);
+                across[within.end..].fill(last);
+                blurred.clear();
+                blurred.resize(end - start, 0.0);
+                for (i, k) in kernel.iter().enumerate() {
+                    for (sum, p) in blurred.iter_mut().zip(&across[i..]) {
+                        *sum += k * p;
+                    }
+                }
+                if start == 0 {
+                    blurred[0] = ground;
+                }
+                if end == width {
+                    blurred[end - start - 1] = ground;
+                }
+                if y == 0 || y == height - 1 {
+                    blurred.fill(ground);
+                }
+                for (column, part) in columns.clone().zip(blurred.chunks(CELL)) {
+                    let at = self.cells[row * self.columns + column] + y % CELL * CELL;
+                    levels[at..at + part.len()].copy_from_slice(part);
+                }
             }
         }
+        (self.across, self.blurred, self.levels) = (across, blurred, levels);
     }
 }
 
-/// A grey level.
-trait Grey: Copy {
-    fn level(self) -> f32;
+/// A picture that is blurred near a contour.
+#[derive(Clone, Copy)]
+struct Blurred<'a> {
+    band: &'a Band,
+    raw: Raw<'a>,
 }
 
-impl Grey for u8 {
-    fn level(self) -> f32 {
-        f32::from(self)
-    }
-}
-
-impl Grey for f32 {
-    fn level(self) -> f32 {
-        self
+impl Picture for Blurred<'_> {
+    fn at(&self, x: usize, y: usize) -> f32 {
+        match self.band.cells[y / CELL * self.band.columns + x / CELL] {
+            OUTSIDE_BAND => self.raw.at(x, y),
+            cell => self.band.levels[cell + y % CELL * CELL + x % CELL],
+        }
     }
 }
 
 /// A picture whose outermost pixels are ground.
-struct Raster<'a, P> {
-    pixels: &'a [P],
+struct Raster<P> {
+    picture: P,
     width: usize,
     height: usize,
     level: f32,
@@ -594,16 +732,17 @@ enum Side {
     Left,
 }
 
-impl<P: Grey> Raster<'_, P> {
-    fn is_inside(&self, p: P) -> bool {
-        self.sense * (p.level() - self.level) > 0.0
+impl<P: Picture> Raster<P> {
+    /// Difference from the level, positive in the shape.
+    fn value(&self, x: usize, y: usize) -> f32 {
+        self.sense * (self.picture.at(x, y) - self.level)
     }
 
     /// Follows the contour that runs up between the pixels `(x - 1, y)` (ground) and `(x, y)` (shape), the shape on its
     /// right-hand side. Marks the shape pixels to the right of its upward steps. Gives the mean slope of the levels.
     fn follow(&self, x: usize, y: usize, visited: &mut [bool], contour: &mut Vec<Point>) -> f64 {
         contour.clear();
-        let value = |x: usize, y: usize| self.sense * (self.pixels[y * self.width + x].level() - self.level);
+        let value = |x: usize, y: usize| self.value(x, y);
         let (start_x, start_y) = (x - 1, y - 1);
         let (mut x, mut y, mut entry) = (start_x, start_y, Side::Bottom);
         let mut slopes = 0.0;

@@ -98,10 +98,10 @@ struct Passage {
 /// a border point across the border, in pixels.
 #[must_use]
 pub fn find(border: &Border, triangulation: &Triangulation, noise: f64) -> Vec<Isthmus> {
-    let area = border.area();
+    let swept = Swept::new(border);
     let mut found: Vec<Isthmus> = persistent_saddles(border, triangulation, noise)
         .into_iter()
-        .filter_map(|saddle| isthmus_at(border, area, triangulation, saddle, noise))
+        .filter_map(|saddle| isthmus_at(border, &swept, triangulation, saddle, noise))
         .collect();
     found.sort_by(|a, b| {
         b.salient.cmp(&a.salient).then(b.persistence.total_cmp(&a.persistence)).then(a.arc[0].total_cmp(&b.arc[0]))
@@ -196,7 +196,7 @@ impl Regions {
 /// The isthmus whose chord is near a side of the triangulation.
 fn isthmus_at(
     border: &Border,
-    area: f64,
+    swept: &Swept,
     triangulation: &Triangulation,
     (side, persistence): (usize, f64),
     noise: f64,
@@ -207,7 +207,8 @@ fn isthmus_at(
     let length = border.length();
     let (s, t) = (s.rem_euclid(length), t.rem_euclid(length));
     let (p, q) = (border.point_at(s), border.point_at(t));
-    let lobe = lobe_area(border, [s, t]);
+    let lobe = swept.lobe(border, [s, t]);
+    let area = swept.total();
     let forward = match polarity {
         Polarity::Positive => border.forward(s, t) <= border.forward(t, s),
         // Border and chord run round a pocket the other way than round the shape.
@@ -308,10 +309,39 @@ fn refine(border: &Border, [i, j]: [usize; 2], noise: f64) -> [f64; 2] {
     }
 }
 
-/// Signed area between the border from `arc[0]` forward to `arc[1]` and the chord back.
-fn lobe_area(border: &Border, arc: [f64; 2]) -> f64 {
-    let count = (border.forward(arc[0], arc[1]) / border.spacing).ceil() as usize + 1;
-    let points = border.sample(arc, 0.0, count);
-    let Some(&origin) = points.first() else { return 0.0 };
-    points.windows(2).map(|w| (w[0] - origin).perp(&(w[1] - origin))).sum::<f64>() / 2.0
+/// Area swept by the ray from the first border point to the others, up to each of them.
+struct Swept {
+    up_to: Vec<f64>,
+}
+
+impl Swept {
+    fn new(border: &Border) -> Self {
+        let Some(&origin) = border.points.first() else { return Self { up_to: vec![0.0] } };
+        let mut sum = 0.0;
+        let mut before = origin - origin;
+        let after = border.points.iter().skip(1).chain([&origin]).map(|p| {
+            let ray = p - origin;
+            sum += before.perp(&ray) / 2.0;
+            before = ray;
+            sum
+        });
+        Self { up_to: std::iter::once(0.0).chain(after).collect() }
+    }
+
+    /// Area of the shape.
+    fn total(&self) -> f64 {
+        self.up_to.last().copied().unwrap_or(0.0)
+    }
+
+    /// Signed area between the border from `arc[0]` forward to `arc[1]` (both in `0..length`) and the chord back.
+    fn lobe(&self, border: &Border, arc: [f64; 2]) -> f64 {
+        let origin = border.points[0];
+        let rays = arc.map(|s| border.point_at(s) - origin);
+        let [from, to] = [0, 1].map(|k| {
+            let i = ((arc[k] / border.spacing) as usize).min(border.points.len() - 1);
+            self.up_to[i] + (border.points[i] - origin).perp(&rays[k]) / 2.0
+        });
+        let whole = if arc[1] < arc[0] { self.total() } else { 0.0 };
+        to - from + whole + rays[1].perp(&rays[0]) / 2.0
+    }
 }
