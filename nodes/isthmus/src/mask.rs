@@ -245,7 +245,9 @@ const TIGHT_SHARE: f64 = 0.9;
 /// How many blocks beyond the inner blocks of a shape its levels matter: the border runs through the first or second.
 const BORDER_BLOCKS: usize = 4;
 /// Most differences of neighbouring pixels looked at to measure the noise: beyond, the figure gets no better.
-const NOISE_SAMPLES: usize = 20_000;
+const NOISE_SAMPLES: usize = 4_000;
+/// Blocks of a shape looked at to measure its levels, roughly: beyond, medians get no better.
+const LEVEL_SAMPLES: usize = 1_000;
 
 /// Finds the shapes of a frame.
 #[must_use]
@@ -424,27 +426,13 @@ impl Segmenter {
             })
         };
         let (width, height) = (c.right - c.left, c.bottom - c.top);
-        let mut contrast = vec![0.0f32; width * height];
         let mut list = Vec::new();
         let mut signed = Vec::new();
-        for row in c.top..c.bottom {
-            for column in c.left..c.right {
-                let block = row * columns + column;
-                if self.owner[block] == k as u32 && inside(column, row) {
-                    contrast[(row - c.top) * width + column - c.left] = ground.residual[block];
-                    list.push(ground.residual[block]);
-                    if let ([plane], [surface]) = (&self.blocks.planes[..], &ground.surfaces[..]) {
-                        signed.push(plane[block] - surface.at(column as f64, row as f64));
-                    }
-                }
-            }
-        }
-        if list.is_empty() {
-            // Thinner than three blocks: the strongest blocks are the best there is.
-            for row in c.top..c.bottom {
-                for column in c.left..c.right {
+        let mut look_at = |step: usize, inner: bool| {
+            for row in (c.top..c.bottom).step_by(step) {
+                for column in (c.left..c.right).step_by(step) {
                     let block = row * columns + column;
-                    if self.owner[block] == k as u32 {
+                    if self.owner[block] == k as u32 && (!inner || inside(column, row)) {
                         list.push(ground.residual[block]);
                         if let ([plane], [surface]) = (&self.blocks.planes[..], &ground.surfaces[..]) {
                             signed.push(plane[block] - surface.at(column as f64, row as f64));
@@ -452,9 +440,15 @@ impl Segmenter {
                     }
                 }
             }
+            list.len()
+        };
+        let step = ((c.area / LEVEL_SAMPLES) as f64).sqrt() as usize;
+        let is_thin = look_at(step.max(1), true) == 0 && look_at(1, true) == 0;
+        if is_thin {
+            // Thinner than three blocks: the strongest blocks are the best there is.
+            look_at(1, false);
             let top = quantile(&mut list, 0.9);
             list = vec![top];
-            contrast.fill(top);
         }
         let middle = quantile(&mut list, 0.5);
         let spread = quantile(&mut list, 0.75) - quantile(&mut list, 0.25);
@@ -475,13 +469,22 @@ impl Segmenter {
         let grey = self.blocks.planes.len() == 1;
         let uniform = spread <= UNIFORM * middle && high - low <= UNIFORM * middle && (one_sided || !grey);
         let ground_level = corners.iter().sum::<f32>() / corners.len() as f32;
+        let mut map = Vec::new();
+        if !uniform {
+            let blocks = (c.top..c.bottom).flat_map(|row| (c.left..c.right).map(move |column| (column, row)));
+            map.extend(blocks.map(|(column, row)| {
+                let block = row * columns + column;
+                let counts = self.owner[block] == k as u32 && inside(column, row);
+                if is_thin { middle } else { f32::from(u8::from(counts)) * ground.residual[block] }
+            }));
+        }
         let mut levels = Levels {
             left: c.left,
             top: c.top,
             width,
             height,
             contrast: middle,
-            map: contrast,
+            map,
             uniform,
             sense,
             one_sided,
@@ -680,7 +683,7 @@ struct Levels {
     height: usize,
     /// Median contrast.
     contrast: f32,
-    /// Contrast of each block of the component's bounding box.
+    /// Contrast of each block of the component's bounding box, unless one pair of levels will do.
     map: Vec<f32>,
     /// Whether one pair of levels will do.
     uniform: bool,

@@ -123,6 +123,8 @@ const MIN_RESIDUAL: f32 = 6.0;
 /// Least difference from the ground as a part of what shapes have on the middle: shadows and glare round them have less,
 /// dark print on black more.
 const MIN_RELATIVE_RESIDUAL: f32 = 0.12;
+/// Blocks that are looked at to find the ground: a shape of a thousandth of the frame still has a dozen among them.
+const SAMPLES: usize = 12_000;
 /// Blocks used for the fit: more do not make a quadratic any better.
 const FIT_SAMPLES: usize = 2_000;
 /// Rounds of fitting the ground and asking again what belongs to it.
@@ -136,42 +138,63 @@ const SURE_SHARE: f64 = 0.62;
 
 /// A class of blocks taken for ground.
 pub(super) struct Candidate {
-    /// Whether each block is ground.
+    /// Whether each block of [`samples`] is ground.
     is_ground: Vec<bool>,
+}
+
+/// Indices of the blocks that are looked at to find the ground, all over the frame.
+fn samples(blocks: &Blocks) -> impl Iterator<Item = usize> + Clone {
+    let count = blocks.columns * blocks.rows;
+    // An odd step does not fall on the same columns row after row.
+    (0..count).step_by((count / SAMPLES) | 1)
+}
+
+/// What tells ground and shapes apart.
+enum Channel {
+    /// One of the frame's channels.
+    Plane(usize),
+    /// The brightest channel.
+    Brightest,
+    /// The darkest channel.
+    Darkest,
+    /// The largest difference from the colour along the rim.
+    Difference([f32; 3]),
+}
+
+impl Channel {
+    fn at(&self, planes: &[Vec<f32>], k: usize) -> f32 {
+        let values = planes.iter().map(|p| p[k]);
+        match self {
+            Self::Plane(c) => planes[*c][k],
+            Self::Brightest => values.fold(0.0, f32::max),
+            Self::Darkest => values.fold(255.0, f32::min),
+            Self::Difference(colour) => values.zip(colour).map(|(v, g)| (v - g).abs()).fold(0.0, f32::max),
+        }
+    }
 }
 
 /// Which blocks may be ground: one candidate, or both classes where the rim does not tell.
 pub(super) fn candidates(blocks: &Blocks) -> Vec<Candidate> {
-    let mut channels: Vec<Vec<f32>> = Vec::new();
     let planes = &blocks.planes;
+    let rim: Vec<usize> = rim_blocks(blocks).collect();
+    let mut channels: Vec<Channel> = (0..planes.len()).map(Channel::Plane).collect();
     if let [r, g, b] = &planes[..] {
-        let combine = |f: fn(f32, f32) -> f32| -> Vec<f32> {
-            r.iter().zip(g).zip(b).map(|((r, g), b)| f(f(*r, *g), *b)).collect()
-        };
-        channels.push(combine(f32::max));
-        channels.push(combine(f32::min));
-        let rim: Vec<usize> = rim_blocks(blocks).collect();
-        let ground: Vec<f32> = planes.iter().map(|p| median(rim.iter().map(|&k| p[k]).collect())).collect();
-        channels.push(
-            (0..r.len())
-                .map(|k| planes.iter().zip(&ground).map(|(p, g)| (p[k] - g).abs()).fold(0.0, f32::max))
-                .collect(),
-        );
+        let colour = [r, g, b].map(|plane| median(rim.iter().map(|&k| plane[k]).collect()));
+        channels.extend([Channel::Brightest, Channel::Darkest, Channel::Difference(colour)]);
     }
-    let best = planes
+    let best = channels
         .iter()
-        .chain(&channels)
-        .map(|channel| (channel, otsu(channel)))
-        .max_by(|a, b| a.1.separation.total_cmp(&b.1.separation));
-    let Some((channel, split)) = best else { return Vec::new() };
-    let (mut bright, mut all) = (0usize, 0usize);
-    for k in rim_blocks(blocks) {
-        bright += usize::from(channel[k] > split.threshold);
-        all += 1;
-    }
-    let share = bright as f64 / all.max(1) as f64;
+        .map(|channel| {
+            let values: Vec<f32> = samples(blocks).map(|k| channel.at(planes, k)).collect();
+            let split = otsu(&values);
+            (channel, values, split)
+        })
+        .max_by(|a, b| a.2.separation.total_cmp(&b.2.separation));
+    let Some((channel, values, split)) = best else { return Vec::new() };
+    let bright = rim.iter().filter(|&&k| channel.at(planes, k) > split.threshold).count();
+    let share = bright as f64 / rim.len().max(1) as f64;
     let class =
-        |bright: bool| Candidate { is_ground: channel.iter().map(|v| (*v > split.threshold) == bright).collect() };
+        |bright: bool| Candidate { is_ground: values.iter().map(|v| (*v > split.threshold) == bright).collect() };
     let likelier = share > 0.5;
     let mut list = vec![class(likelier)];
     if share.max(1.0 - share) < SURE_SHARE {
@@ -195,39 +218,43 @@ fn rim_blocks(blocks: &Blocks) -> impl Iterator<Item = usize> {
 pub(super) fn fit(blocks: &Blocks, candidate: Candidate) -> Ground {
     let Candidate { mut is_ground } = candidate;
     let mut ground = Ground::default();
-    let count = blocks.columns * blocks.rows;
-    let mut levels = vec![0.0; blocks.columns];
+    let mut residuals = Vec::with_capacity(is_ground.len());
     for _ in 0..ROUNDS {
         ground.surfaces = blocks.planes.iter().map(|plane| fit_surface(blocks, plane, &is_ground)).collect();
-        ground.residual.clear();
-        ground.residual.resize(count, 0.0);
-        for (plane, surface) in blocks.planes.iter().zip(&ground.surfaces) {
-            let rows = plane.chunks_exact(blocks.columns).zip(ground.residual.chunks_exact_mut(blocks.columns));
-            for (row, (values, residuals)) in rows.enumerate() {
-                surface.fill_line(row as f64, 0.0, 1.0, &mut levels);
-                for ((residual, value), level) in residuals.iter_mut().zip(values).zip(&levels) {
-                    *residual = residual.max((value - level).abs());
-                }
-            }
-        }
-        let stride = (count / (4 * FIT_SAMPLES)).max(1);
-        let scatter: Vec<f32> =
-            (0..count).step_by(stride).filter(|&k| is_ground[k]).map(|k| ground.residual[k]).collect();
+        let residual = |k: usize| {
+            let (column, row) = ((k % blocks.columns) as f64, (k / blocks.columns) as f64);
+            let channels = blocks.planes.iter().zip(&ground.surfaces);
+            channels.map(|(plane, surface)| (plane[k] - surface.at(column, row)).abs()).fold(0.0, f32::max)
+        };
+        residuals.clear();
+        residuals.extend(samples(blocks).map(residual));
+        let scatter: Vec<f32> = residuals.iter().zip(&is_ground).filter(|(_, g)| **g).map(|(r, _)| *r).collect();
         // The median of absolute residuals is 0.67 standard deviations.
         let sigma = median(scatter) / 0.6745;
-        let split = otsu(&ground.residual);
+        let split = otsu(&residuals);
         let standing_out = split.mean_above;
         ground.threshold = (OUTLIER * sigma).max(MIN_RESIDUAL).max(MIN_RELATIVE_RESIDUAL * standing_out);
         let half = (standing_out / 2.0).max(ground.threshold);
         // Whatever is nearer to the ground than to the shapes may be ground, shadows included; the next fit is robust.
         let mut changed = false;
-        for (is_ground, residual) in is_ground.iter_mut().zip(&ground.residual) {
+        for (is_ground, residual) in is_ground.iter_mut().zip(&residuals) {
             let now = *residual < half;
             changed |= now != *is_ground;
             *is_ground = now;
         }
         if !changed {
             break;
+        }
+    }
+    let mut levels = vec![0.0; blocks.columns];
+    ground.residual = vec![0.0; blocks.columns * blocks.rows];
+    for (plane, surface) in blocks.planes.iter().zip(&ground.surfaces) {
+        let rows = plane.chunks_exact(blocks.columns).zip(ground.residual.chunks_exact_mut(blocks.columns));
+        for (row, (values, residuals)) in rows.enumerate() {
+            surface.fill_line(row as f64, 0.0, 1.0, &mut levels);
+            for ((residual, value), level) in residuals.iter_mut().zip(values).zip(&levels) {
+                *residual = residual.max((value - level).abs());
+            }
         }
     }
     ground
@@ -238,10 +265,11 @@ fn fit_surface(blocks: &Blocks, plane: &[f32], is_ground: &[bool]) -> Surface {
     let scale = [blocks.columns, blocks.rows].map(|n| 2.0 / (n.max(2) - 1) as f64);
     let total = is_ground.iter().filter(|g| **g).count();
     let stride = (total / FIT_SAMPLES).max(1);
-    let samples: Vec<(Vector6<f64>, f64)> = (0..plane.len())
-        .filter(|&k| is_ground[k])
+    let samples: Vec<(Vector6<f64>, f64)> = samples(blocks)
+        .zip(is_ground)
+        .filter(|(_, is_ground)| **is_ground)
         .step_by(stride)
-        .map(|k| {
+        .map(|(k, _)| {
             let (column, row) = (k % blocks.columns, k / blocks.columns);
             (Surface::basis(scale, column as f64, row as f64), f64::from(plane[k]))
         })
