@@ -318,7 +318,7 @@ impl Swept {
     fn new(border: &Border) -> Self {
         let Some(&origin) = border.points.first() else { return Self { up_to: vec![0.0] } };
         let mut sum = 0.0;
-        let mut before = origin - origin;
+        let mut before = Vector2::zeros();
         let after = border.points.iter().skip(1).chain([&origin]).map(|p| {
             let ray = p - origin;
             sum += before.perp(&ray) / 2.0;
