@@ -1,5 +1,7 @@
 //! The command line `jigsaw` as a user runs it: the real binary, real files, exit codes.
 
+#![allow(clippy::unwrap_used, reason = "a test fails by panicking")]
+
 use std::fs;
 use std::path::Path;
 use std::process::{Command, Output};

@@ -45,7 +45,8 @@ const SPACING: f64 = 24.0;
 struct Drawn {
     piece: usize,
     outline: Vec<Point>,
-    centroid: Point,
+    /// Where its id is written, and the radius of the disc round that point in which nothing else of it lies.
+    label: (Point, f64),
     low: Point,
     high: Point,
     picture_from_image: nalgebra::Similarity2<f64>,
@@ -56,14 +57,22 @@ impl Drawn {
         let border = &pieces.get(piece)?.features.border;
         let outline: Vec<Point> = border.points.iter().map(|p| picture_from_image * p).collect();
         let [low, high] = bounds(&outline)?;
-        let centroid = picture_from_image * border.centroid();
-        Some(Self { piece, outline, centroid, low, high, picture_from_image })
+        // The widest place of the piece, which its skeleton knows.
+        let branches = &pieces[piece].features.endoskeleton.branches;
+        let widest = branches.iter().flatten().max_by(|a, b| a.distance.total_cmp(&b.distance));
+        let label = match widest {
+            Some(widest) => (picture_from_image * widest.point, widest.distance * picture_from_image.scaling()),
+            None => (picture_from_image * border.centroid(), 0.31 * (high - low).min()),
+        };
+        Some(Self { piece, outline, label, low, high, picture_from_image })
     }
 }
 
+/// None without points, or where one of them is no number.
 fn bounds(points: &[Point]) -> Option<[Point; 2]> {
     let first = points.first()?;
-    Some(points.iter().fold([*first; 2], |[low, high], p| [low.inf(p), high.sup(p)]))
+    let finite = points.iter().all(|p| p.x.is_finite() && p.y.is_finite());
+    finite.then(|| points.iter().fold([*first; 2], |[low, high], p| [low.inf(p), high.sup(p)]))
 }
 
 /// Draws the pieces in place, each with its id, its matings marked, the pieces left over below.
@@ -234,7 +243,7 @@ fn draw_id(canvas: &mut Canvas, pieces: &[Piece], drawn: &Drawn, prefix: usize, 
     let id = &pieces[drawn.piece].id;
     let short = id.get(prefix..).filter(|rest| !rest.is_empty()).unwrap_or(id);
     let tiny = short.trim_start_matches('0');
-    let room = 0.62 * (drawn.high - drawn.low).min();
+    let (middle, radius) = drawn.label;
     let forms = [
         (id.as_str(), Size::Normal),
         (id, Size::Small),
@@ -242,10 +251,10 @@ fn draw_id(canvas: &mut Canvas, pieces: &[Piece], drawn: &Drawn, prefix: usize, 
         (short, Size::Small),
         (tiny, Size::Small),
     ];
-    let fits = |(text, size): &(&str, Size)| !text.is_empty() && size.width(text, true) < room && size.height() < room;
+    let half = |text: &str, size: Size| Vector2::new(0.5 * size.width(text, true), 0.5 * size.height());
+    let fits = |(text, size): &(&str, Size)| !text.is_empty() && half(text, *size).norm() < radius;
     if let Some((text, size)) = forms.into_iter().find(fits) {
-        let half = Vector2::new(0.5 * size.width(text, true), 0.5 * size.height());
-        canvas.text(drawn.centroid - half, text, size, true, colour);
+        canvas.text(middle - half(text, size), text, size, true, colour);
     }
 }
 

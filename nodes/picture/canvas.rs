@@ -25,6 +25,9 @@ pub(super) const BLUE: Rgb = [0, 114, 178];
 pub(super) const VERMILLION: Rgb = [213, 94, 0];
 pub(super) const PURPLE: Rgb = [204, 121, 167];
 
+/// Greatest coordinate that is drawn, in pixels: far beyond any picture, and safe in the 32-bit numbers of the renderer.
+const FAR: f64 = 1e6;
+
 /// Longest side of a picture, in pixels: beyond it viewers and message buffers have trouble.
 pub(super) const MAX_SIDE: u32 = 8192;
 
@@ -108,7 +111,9 @@ impl Canvas {
 
     /// A line through points; `closed` joins the last to the first.
     pub(super) fn line(&mut self, points: impl IntoIterator<Item = Point>, closed: bool, pen: Pen) {
-        let Some(path) = path(points, closed) else { return };
+        // The renderer insists on a width.
+        let drawable = pen.width > 0.0 && pen.width < FAR;
+        let Some(path) = path(points, closed).filter(|_| drawable) else { return };
         let dash = if pen.dashed {
             let unit = (pen.width * 2.5) as f32;
             StrokeDash::new(vec![2.0 * unit, 1.6 * unit], 0.0)
@@ -162,6 +167,9 @@ impl Canvas {
     }
 
     fn plain_disc(&mut self, centre: Point, radius: f64, colour: Rgb) {
+        if !(centre.x.abs() < FAR && centre.y.abs() < FAR && radius < FAR) {
+            return;
+        }
         if let Some(path) = PathBuilder::from_circle(centre.x as f32, centre.y as f32, radius as f32) {
             self.pixmap.fill_path(&path, &paint(colour, 1.0), FillRule::Winding, Transform::identity(), None);
         }
@@ -244,7 +252,7 @@ fn paint(colour: Rgb, opacity: f32) -> Paint<'static> {
 
 fn path(points: impl IntoIterator<Item = Point>, closed: bool) -> Option<tiny_skia::Path> {
     let mut builder = PathBuilder::new();
-    for p in points.into_iter().filter(|p| p.x.is_finite() && p.y.is_finite()) {
+    for p in points.into_iter().filter(|p| p.x.abs() < FAR && p.y.abs() < FAR) {
         if builder.is_empty() {
             builder.move_to(p.x as f32, p.y as f32);
         } else {

@@ -6,6 +6,7 @@ use isthmus::Point;
 use isthmus::isthmus::{Isthmus, Polarity};
 use isthmus::mask::{Aoi, Cutout};
 use isthmus::profile::distance_function;
+use isthmus::skeleton::SkeletonPoint;
 use nalgebra::Vector2;
 
 use super::canvas::{BLACK, BLUE, Canvas, GREY, INK, ORANGE, PALE, Pen, Rgb, SKY, Size, VERMILLION, WHITE};
@@ -98,7 +99,7 @@ pub fn inspection(id: &str, source: &str, cutout: &Cutout, features: &Features, 
     let picture_from_frame = View { origin: corner(window), scale, top_left };
     let sample = |p: Point| level(&cutout.pixels, window.width, window.height, p - corner(window).coords);
     picture_from_frame.draw_ground(&mut canvas, Vector2::new(columns, rows), sample);
-    picture_from_frame.draw_shape(&mut canvas, features, aoi, true);
+    picture_from_frame.draw_shape(&mut canvas, features, cutout, true);
 
     let right = MARGIN + panel.0 + MARGIN;
     let longest = plotted.iter().map(|&k| features.isthmuses[k].path_length).fold(1.0, f64::max);
@@ -126,7 +127,7 @@ pub fn frame_overview(frame: &GrayImage, pieces: &[(&str, &Cutout, &Features)], 
     let sample = |p: Point| level(frame.as_raw(), frame.width(), frame.height(), p + Vector2::repeat(0.5));
     view.draw_ground(&mut canvas, Vector2::new(columns, rows), sample);
     for (_, cutout, features) in pieces {
-        view.draw_shape(&mut canvas, features, cutout.aoi, false);
+        view.draw_shape(&mut canvas, features, cutout, false);
     }
     for (id, cutout, features) in pieces {
         let aoi = cutout.aoi;
@@ -142,6 +143,11 @@ pub fn frame_overview(frame: &GrayImage, pieces: &[(&str, &Cutout, &Features)], 
 /// Upper left corner of a rectangle of pixels: half a pixel before the first centre.
 fn corner(area: Aoi) -> Point {
     Point::new(f64::from(area.x) - 0.5, f64::from(area.y) - 0.5)
+}
+
+fn contains(area: Aoi, p: Point) -> bool {
+    let inside = p - corner(area);
+    (0.0..=f64::from(area.width)).contains(&inside.x) && (0.0..=f64::from(area.height)).contains(&inside.y)
 }
 
 /// Grey level between pixels; `p` counts from the upper left corner of the first pixel.
@@ -180,7 +186,8 @@ impl View {
         });
     }
 
-    fn draw_shape(&self, canvas: &mut Canvas, features: &Features, aoi: Aoi, detailed: bool) {
+    fn draw_shape(&self, canvas: &mut Canvas, features: &Features, cutout: &Cutout, detailed: bool) {
+        let (aoi, window) = (cutout.aoi, cutout.window);
         // Line widths grow with the picture, so that a small picture isn't drowned in lines.
         let unit = (self.scale / 2.0).clamp(0.6, 1.0);
         let place = |p: Point| self.place(p);
@@ -190,7 +197,11 @@ impl View {
 
         for (skeleton, colour) in [(&features.exoskeleton, SKY), (&features.endoskeleton, ORANGE)] {
             for branch in &skeleton.branches {
-                canvas.line(branch.iter().map(|p| place(p.point)), false, Pen::new(colour, 1.6 * unit));
+                // The exoskeleton goes on outside of what is shown.
+                let shown = |p: &SkeletonPoint| contains(window, p.point);
+                for part in branch.split(|p| !shown(p)) {
+                    canvas.line(part.iter().map(|p| place(p.point)), false, Pen::new(colour, 1.6 * unit));
+                }
             }
         }
         for isthmus in features.isthmuses.iter().filter(|i| i.salient) {
