@@ -77,7 +77,9 @@ fn run_capture(frames: Vec<Frame>, calls: Vec<Call<Trigger>>, health: &Arc<Healt
 fn run_feature(pieces: Vec<PieceImage>, health: &Arc<Health>) -> Vec<PieceFeatures> {
     let (sender, receiver) = mpsc::unbounded();
     let parameters = parameters(feature::params::PARAMETERS);
-    smol::block_on(feature::run(stream::iter(pieces), sender, parameters, Arc::clone(health)));
+    let (images, _) = mpsc::channel(0);
+    let overlays = feature::Overlays { images, wanted: Box::new(|| false) };
+    smol::block_on(feature::run(stream::iter(pieces), sender, overlays, parameters, Arc::clone(health)));
     smol::block_on(receiver.collect())
 }
 
@@ -102,7 +104,8 @@ fn run_solver_with_goals(
     let (assembly, assemblies) = mpsc::channel(room);
     let (transform, transforms) = mpsc::channel(room);
     let (marker, markers) = mpsc::channel(room);
-    let outputs = solver::Outputs { assembly, transforms: transform, markers: marker };
+    let (solutions, _) = mpsc::unbounded();
+    let outputs = solver::Outputs { assembly, transforms: transform, markers: marker, solutions };
     let parameters = parameters(solver::params::PARAMETERS);
     let requests =
         solver::Requests { resets: stream::iter(resets), solves: stream::empty(), goals: stream::iter(goals) };

@@ -220,3 +220,18 @@ fn a_node_whose_middleware_died_ends_with_code_3() {
     assert_eq!(status.code(), Some(3), "{said}");
     assert!(said.contains("gone deaf"), "{said}");
 }
+
+#[test]
+fn a_composed_cell_gives_the_same_assembly() {
+    let domain = domain(3);
+    let options = Options { rows: 2, columns: 3, seed: 5, noise: 2.0, blur: 1.0, ..Options::default() };
+    let folder = Folder::of_puzzle("cell", &options);
+    let args = ["cell", "--source", folder.path().to_str().unwrap(), "--ros-args", "-r", "__ns:=/cell"];
+    let cell = Process::start(env!("CARGO_BIN_EXE_jigsaw"), domain, &args);
+    let mut listener = Listener::in_namespace(domain, "/cell");
+    let assembly = listener.wait(&topics::ASSEMBLY, |assembly| assembly.pieces.len() == 6 && complete(assembly));
+    assert!(assembly.unplaced.is_empty());
+    cell.signal(nix::sys::signal::Signal::SIGINT);
+    let (status, said) = cell.end(END);
+    assert_eq!(status.code(), Some(0), "{said}");
+}

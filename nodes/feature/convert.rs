@@ -1,11 +1,14 @@
 //! Messages of pieces to cutouts, features to messages.
 
+use image::RgbImage;
 use isthmus::isthmus::{Isthmus, Polarity};
 use isthmus::mask::{Aoi, Cutout};
 use isthmus::skeleton::Skeleton;
 use isthmus::{Features, Point, profile};
 use jigsaw_msgs::geometry_msgs::msg::Point32;
 use jigsaw_msgs::msg::{Isthmus as IsthmusMessage, PieceFeatures, PieceImage, SkeletonBranch};
+use jigsaw_msgs::sensor_msgs::msg::Image;
+use jigsaw_msgs::std_msgs::msg::Header;
 
 use crate::capture::convert::{MAX_AREA_PX, MAX_SIDE_PX};
 
@@ -114,6 +117,19 @@ pub fn cutout(message: &mut PieceImage) -> Result<Cutout, PieceImageError> {
         ground_level: message.ground_level,
         noise_level: message.noise_level,
     })
+}
+
+/// A picture as a message, `rgb8`.
+pub fn image_message(header: Header, picture: RgbImage) -> Image {
+    Image {
+        header,
+        height: picture.height(),
+        width: picture.width(),
+        encoding: "rgb8".to_owned(),
+        is_bigendian: 0,
+        step: 3 * picture.width(),
+        data: picture.into_raw(),
+    }
 }
 
 /// The message of a piece's features; header, name and place are those of the piece's picture.

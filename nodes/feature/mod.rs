@@ -5,15 +5,19 @@ pub mod params;
 
 use std::sync::Arc;
 
+use futures::channel::mpsc;
 use futures::{Sink, SinkExt, Stream, StreamExt};
 use isthmus::Extractor;
 use jigsaw_msgs::msg::{PieceFeatures, PieceImage};
+use jigsaw_msgs::sensor_msgs::msg::Image;
 
 use crate::capture::params::threads;
+use crate::picture::{InspectionStyle, inspection};
 use crate::ros::health::Health;
 use crate::ros::params::Parameters;
 use crate::ros::process::{ProcessError, Program, Work};
-use crate::ros::session::Session;
+use crate::ros::session::{Audience, Session};
+use crate::ros::topics;
 use convert::PieceImageError;
 
 /// The program of this node.
@@ -26,18 +30,37 @@ pub const PROGRAM: Program = Program {
     parameters: params::PARAMETERS,
 };
 
+/// How a piece is drawn on `pieces/overlay`: as large as it was seen, without plots, so that drawing keeps up.
+const OVERLAY_STYLE: InspectionStyle = InspectionStyle { piece_side: 500.0, plots: false };
+
+/// Where pictures of the shape analysis go, while someone listens.
+pub struct Overlays {
+    /// The pictures; what doesn't fit is left out.
+    pub images: mpsc::Sender<Image>,
+    /// Whether someone listens.
+    pub wanted: Box<dyn Fn() -> bool>,
+}
+
+impl Overlays {
+    fn new(images: mpsc::Sender<Image>, audience: Audience) -> Self {
+        Self { images, wanted: Box::new(move || audience.count() > 0) }
+    }
+}
+
 /// Opens the node and gives its loop.
 ///
 /// # Errors
 /// A name that is no name; a refusal of the middleware.
 pub fn open(
-    session: Session,
+    mut session: Session,
     pieces: impl Stream<Item = PieceImage> + Unpin + 'static,
     features: impl Sink<PieceFeatures> + Unpin + 'static,
 ) -> Result<Work, ProcessError> {
+    let (images, audience) = session.publish(&topics::OVERLAY)?;
+    let overlays = Overlays::new(images, audience);
     let (parameters, health) = (Arc::clone(&session.parameters), Arc::clone(&session.health));
     Ok(Box::pin(async move {
-        run(pieces, features, parameters, health).await;
+        run(pieces, features, overlays, parameters, health).await;
         drop(session);
         Ok(())
     }))
@@ -47,19 +70,30 @@ pub fn open(
 pub async fn run(
     pieces: impl Stream<Item = PieceImage> + Unpin,
     mut features: impl Sink<PieceFeatures> + Unpin,
+    mut overlays: Overlays,
     parameters: Arc<Parameters>,
     health: Arc<Health>,
 ) {
     let threads = threads(&parameters, &params::THREADS);
-    let mut extracted = pieces.map(|piece| smol::unblock(move || extract(piece))).buffered(threads);
+    let wanted = overlays.wanted;
+    let mut extracted = pieces
+        .map(|piece| {
+            let draw = wanted();
+            smol::unblock(move || extract(piece, draw))
+        })
+        .buffered(threads);
     while let Some(result) = extracted.next().await {
         match result {
-            Ok(message) => {
+            Ok((message, overlay)) => {
                 health.received();
                 health.state("analysing pieces");
                 log::debug!("piece {}: {} isthmuses", message.id, message.isthmuses.len());
                 if features.send(message).await.is_ok() {
                     health.published();
+                }
+                if let Some(overlay) = overlay {
+                    // A listener that is behind misses one.
+                    let _ = overlays.images.try_send(overlay);
                 }
             }
             Err(refusal) => health.refuse(refusal.kind(), &refusal.to_string()),
@@ -68,10 +102,14 @@ pub async fn run(
 }
 
 /// The work on one piece that is done beside the loop.
-fn extract(mut piece: PieceImage) -> Result<PieceFeatures, PieceImageError> {
+fn extract(mut piece: PieceImage, draw: bool) -> Result<(PieceFeatures, Option<Image>), PieceImageError> {
     let cutout = convert::cutout(&mut piece)?;
     let features = Extractor::default()
         .extract(&cutout)
         .map_err(|e| PieceImageError::Shape { id: piece.id.clone(), reason: e.to_string() })?;
-    Ok(convert::features_message(&piece, &features))
+    let overlay = draw.then(|| {
+        let picture = inspection(&piece.id, &piece.source, &cutout, &features, OVERLAY_STYLE);
+        convert::image_message(piece.header.clone(), picture)
+    });
+    Ok((convert::features_message(&piece, &features), overlay))
 }

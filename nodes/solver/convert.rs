@@ -13,13 +13,15 @@ use jigsaw_msgs::geometry_msgs::msg::{Point as PointMessage, Pose, Transform, Tr
 use jigsaw_msgs::msg::{
     Assembly as AssemblyMessage, CandidateCounts, Isthmus as IsthmusMessage, Mating, PieceFeatures, PiecePose,
 };
+use jigsaw_msgs::sensor_msgs::msg::Image;
 use jigsaw_msgs::std_msgs::msg::{ColorRGBA, Header};
 use jigsaw_msgs::tf2_msgs::msg::TFMessage;
 use jigsaw_msgs::visualization_msgs::msg::{Marker, MarkerArray};
 use nalgebra::{Isometry2, Point2};
 
 use crate::capture::convert::MAX_SIDE_PX;
-use crate::feature::convert::{MAX_ID_LENGTH, is_piece_id};
+use crate::feature::convert::{MAX_ID_LENGTH, image_message, is_piece_id};
+use crate::picture::{self, AssemblyStyle};
 use crate::ros::transforms::{PixelPlane, pose_message};
 
 /// Most points of a border: a piece as large as the largest frame, sampled at every pixel of its circumference.
@@ -429,6 +431,11 @@ impl Solution {
             Some(transform(&self.naming.puzzle_frame, child, &sighting.stamp, goal))
         });
         TFMessage { transforms: observed.chain(goals).collect() }
+    }
+
+    /// The message on `assembly/image`.
+    pub fn image_message(&self) -> Image {
+        image_message(self.header(), picture::assembly(&self.pieces, &self.assembly, AssemblyStyle::default()))
     }
 
     /// The message on `assembly/markers`: the outlines of the pieces in place and their names.

@@ -16,6 +16,7 @@ use futures::{FutureExt, SinkExt, Stream, StreamExt, pin_mut};
 use jigsaw::{Assembly, Params, Piece, Solver, SolverError};
 use jigsaw_msgs::action::{Assemble, AssembleFeedback, AssembleResult};
 use jigsaw_msgs::msg::{Assembly as AssemblyMessage, PieceFeatures};
+use jigsaw_msgs::sensor_msgs::msg::Image;
 use jigsaw_msgs::std_srvs::srv::{Trigger, TriggerResponse};
 use jigsaw_msgs::tf2_msgs::msg::TFMessage;
 use jigsaw_msgs::visualization_msgs::msg::MarkerArray;
@@ -52,6 +53,41 @@ pub struct Outputs {
     pub transforms: mpsc::Sender<TFMessage>,
     /// The outlines.
     pub markers: mpsc::Sender<MarkerArray>,
+    /// What is to be drawn; [`draw`] takes it from there.
+    pub solutions: mpsc::UnboundedSender<Arc<Solution>>,
+}
+
+/// How often is looked whether someone has begun to listen to the pictures.
+const AUDIENCE_PERIOD: Duration = Duration::from_millis(500);
+
+/// Draws the latest solution while someone listens. Ends with the solutions.
+pub async fn draw(
+    solutions: impl Stream<Item = Arc<Solution>> + Unpin,
+    mut images: mpsc::Sender<Image>,
+    wanted: impl Fn() -> bool,
+) {
+    let mut solutions = solutions.fuse();
+    let mut latest = None;
+    loop {
+        let mut tick = FutureExt::fuse(smol::Timer::after(AUDIENCE_PERIOD));
+        futures::select! {
+            solution = solutions.next() => match solution {
+                Some(solution) => latest = Some(solution),
+                None => break,
+            },
+            _ = tick => {}
+        }
+        // What came while the last one was drawn: only the newest is of use.
+        while let Some(Some(solution)) = solutions.next().now_or_never() {
+            latest = Some(solution);
+        }
+        if wanted()
+            && let Some(solution) = latest.take()
+            && images.send(smol::unblock(move || solution.image_message()).await).await.is_err()
+        {
+            break;
+        }
+    }
 }
 
 /// Opens the topics and services of the node and gives its loop, which takes the shapes from `features`.
@@ -64,12 +100,17 @@ pub fn open(
 ) -> Result<Work, ProcessError> {
     let resets = session.serve::<Trigger>(topics::RESET_SERVICE)?;
     let solves = session.serve::<Trigger>(topics::SOLVE_SERVICE)?;
+    // Drawing never holds up solving.
+    let (to_draw, solutions) = mpsc::unbounded();
     let goals = session.act::<Assemble, convert::AssembleGoal>(topics::ASSEMBLE_ACTION)?;
     let outputs = Outputs {
         assembly: session.publish(&topics::ASSEMBLY)?.0,
         transforms: session.publish(&topics::TF_STATIC)?.0,
         markers: session.publish(&topics::ASSEMBLY_MARKERS)?.0,
+        solutions: to_draw,
     };
+    let (images, audience) = session.publish(&topics::ASSEMBLY_IMAGE)?;
+    session.spawn(draw(solutions, images, move || audience.count() > 0));
     let (parameters, health) = (Arc::clone(&session.parameters), Arc::clone(&session.health));
     Ok(Box::pin(async move {
         run(features, Requests { resets, solves, goals }, outputs, parameters, health).await;
@@ -401,6 +442,7 @@ impl Table {
         // A closed output is that of a process that ends.
         let _ = self.outputs.assembly.send(message).await;
         let _ = self.outputs.markers.send(solution.markers_message()).await;
+        let _ = self.outputs.solutions.unbounded_send(Arc::new(solution));
         for call in self.waiting.drain(..) {
             answer(call, true, summary.clone());
         }
