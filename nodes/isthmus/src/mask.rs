@@ -12,7 +12,7 @@
 //!    divided by the local contrast. Pixels beyond half-way are joined to components once more: neighbours whose shadows
 //!    or glow met come apart.
 //! 4. *Rejection*, each with its [`Reason`]: cut by the frame's edge, too small beside the others, thread-like (hairs,
-//!    scanner edges), faint (glare), two shapes that touch.
+//!    scanner edges), faint (glare), two shapes that touch (of about twice the usual area, with an isthmus between the halves).
 //!
 //! # Cost
 //! Linear in the number of pixels; memory linear as well, since thread-like components are never cut out.
@@ -37,6 +37,10 @@ mod runs;
 
 use ground::{Blocks, Ground, median, quantile};
 use runs::{Component, Components};
+
+use crate::contour::Border;
+use crate::isthmus::{self, Polarity};
+use crate::skeleton::Triangulation;
 
 /// A rectangle of whole pixels of the source frame.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -248,6 +252,16 @@ const BORDER_BLOCKS: usize = 4;
 const NOISE_SAMPLES: usize = 4_000;
 /// Blocks of a shape looked at to measure its levels, roughly: beyond, medians get no better.
 const LEVEL_SAMPLES: usize = 1_000;
+
+/// Least number of shapes in a frame whose median area says what one shape has.
+const TOUCHING_SHAPES: usize = 3;
+/// Least area of two shapes that touch, in median areas: the two smallest pieces of a puzzle are larger together.
+const TOUCHING_AREA: f64 = 1.5;
+/// Least area of each of the two, in median areas.
+const TOUCHING_LOBE: f64 = 0.5;
+/// Greatest width of the place where two shapes touch, as a part of the square root of the median area: the neck of a tab
+/// that reaches into the other's blank is not wider.
+const TOUCHING_WIDTH: f64 = 0.35;
 
 /// Finds the shapes of a frame.
 #[must_use]
@@ -648,6 +662,13 @@ fn sift(frame: &Frame<'_>, parameters: &Parameters, found: Vec<Found>, mut rejec
         })
         .map_or(0, |f| f.0);
     let typical_contrast = median(by_area.iter().filter(|f| 2 * f.0 >= typical_area).map(|f| f.1).collect());
+    // The lower median, small fry aside: of three shapes two of which touch, a single one.
+    let usual: Vec<usize> = by_area
+        .iter()
+        .map(|f| f.0)
+        .filter(|a| *a as f64 >= parameters.min_relative_area * typical_area as f64)
+        .collect();
+    let median_area = if usual.len() < TOUCHING_SHAPES { usize::MAX } else { usual[(usual.len() - 1) / 2] };
     let rim = 2 * (frame.width + frame.height);
     let mut cutouts = Vec::new();
     for f in found {
@@ -662,6 +683,8 @@ fn sift(frame: &Frame<'_>, parameters: &Parameters, found: Vec<Found>, mut rejec
             Some(Reason::Faint)
         } else if f.contact > 0 && !tight {
             Some(Reason::CutByFrame)
+        } else if f.area as f64 >= TOUCHING_AREA * median_area as f64 && joins_two(&f.cutout, median_area as f64) {
+            Some(Reason::Touching)
         } else {
             None
         };
@@ -673,6 +696,20 @@ fn sift(frame: &Frame<'_>, parameters: &Parameters, found: Vec<Found>, mut rejec
     cutouts.sort_by_key(|c| (c.aoi.y, c.aoi.x));
     rejected.sort_by_key(|r| (r.aoi.y, r.aoi.x));
     Segmentation { cutouts, rejected }
+}
+
+/// Whether a shape is two of about a given area each, joined where they touch: at an isthmus that is narrow for their size.
+fn joins_two(cutout: &Cutout, area: f64) -> bool {
+    let Ok((border, noise)) = Border::from_cutout(cutout) else { return false };
+    let Ok(triangulation) = Triangulation::new(&border) else { return false };
+    let whole = border.area();
+    isthmus::find(&border, &triangulation, noise).iter().any(|i| {
+        let count = (i.path_length / border.spacing).ceil() as usize + 1;
+        let lobe = Border { points: border.sample(i.arc, 0.0, count), spacing: border.spacing }.area();
+        i.polarity == Polarity::Positive
+            && i.width <= TOUCHING_WIDTH * area.sqrt()
+            && lobe.min(whole - lobe) >= TOUCHING_LOBE * area
+    })
 }
 
 /// Contrast of a coarse component against the ground.

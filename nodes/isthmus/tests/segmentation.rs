@@ -1,0 +1,157 @@
+//! Pieces are found under bad light, on any ground and among dirt; what is left out is named.
+
+#![allow(clippy::unwrap_used, reason = "test program: its functions beside the tests fail by panic too")]
+
+mod shapes;
+
+use isthmus::Extractor;
+use isthmus::mask::{Frame, Parameters, Reason, Segmentation, segment};
+use shapes::{Camera, Neck, Piece, pose};
+
+/// Side of the frames, in pixels.
+const SIDE: usize = 900;
+/// Size of the pieces' bodies, in pixels.
+const SIZE: f64 = 220.0;
+/// Centres of the pieces.
+const CENTRES: [(f64, f64); 4] = [(230.0, 240.0), (650.0, 220.0), (240.0, 660.0), (640.0, 650.0)];
+/// Most that the middle of a neck may be off, in pixels: uneven light and noise included.
+const MIDDLE: f64 = 1.0;
+
+/// A frame with four pieces, and their necks.
+fn scene(camera: Camera) -> (Vec<u8>, Vec<Neck>) {
+    let camera = Camera { width: SIDE, height: SIDE, ..camera };
+    let (mut outlines, mut necks) = (Vec::new(), Vec::new());
+    for (k, (x, y)) in CENTRES.into_iter().enumerate() {
+        let piece = Piece::random(SIZE, 10 + k as u64);
+        let pose = pose(0.2 + 0.1 * k as f64, 1.0, x, y);
+        outlines.push(piece.outline(&pose));
+        necks.extend(piece.necks(&pose));
+    }
+    (camera.picture(&outlines), necks)
+}
+
+fn grey(pixels: &[u8]) -> Segmentation {
+    segment(&Frame::grey(SIDE as u32, SIDE as u32, pixels).unwrap(), &Parameters::default())
+}
+
+/// All four pieces are there, and all their necks where they belong.
+fn check(found: &Segmentation, necks: &[Neck], what: &str) {
+    assert_eq!(found.cutouts.len(), CENTRES.len(), "{what}: {:?}", found.rejected);
+    let mut extractor = Extractor::default();
+    let isthmuses: Vec<_> = found.cutouts.iter().flat_map(|c| extractor.extract(c).unwrap().isthmuses).collect();
+    for neck in necks {
+        let same = isthmuses.iter().filter(|i| i.salient && i.polarity == neck.polarity);
+        let off = same.map(|i| (i.point - neck.middle()).norm()).fold(f64::MAX, f64::min);
+        assert!(off < MIDDLE, "{what}: {neck:?} is {off} px off");
+    }
+}
+
+/// Puts a disc of a level on a frame.
+fn disc(pixels: &mut [u8], (x, y): (f64, f64), radius: f64, mut level: impl FnMut(u8, f64) -> u8) {
+    for (k, p) in pixels.iter_mut().enumerate() {
+        let distance = ((k % SIDE) as f64 - x).hypot((k / SIDE) as f64 - y);
+        if distance < radius {
+            *p = level(*p, distance / radius);
+        }
+    }
+}
+
+#[test]
+fn dark_on_light_and_light_on_dark() {
+    for (shape_level, ground_level) in [(40.0, 215.0), (215.0, 40.0), (100.0, 140.0), (140.0, 100.0), (0.0, 255.0)] {
+        let (pixels, necks) = scene(Camera { shape_level, ground_level, noise: 3.0, ..Camera::default() });
+        check(&grey(&pixels), &necks, &format!("{shape_level} on {ground_level}"));
+    }
+}
+
+#[test]
+fn corners_of_half_the_light() {
+    for (shape_level, ground_level) in [(40.0, 215.0), (215.0, 40.0)] {
+        let camera = Camera { shape_level, ground_level, vignette: 0.5, noise: 3.0, ..Camera::default() };
+        let (pixels, necks) = scene(camera);
+        check(&grey(&pixels), &necks, &format!("{shape_level} on {ground_level}"));
+    }
+}
+
+#[test]
+fn a_spot_of_glare_on_the_ground() {
+    let (mut pixels, necks) = scene(Camera { ground_level: 190.0, noise: 3.0, ..Camera::default() });
+    disc(&mut pixels, (445.0, 440.0), 60.0, |p, r| p.saturating_add((60.0 * (1.0 - r * r)) as u8));
+    check(&grey(&pixels), &necks, "glare");
+}
+
+#[test]
+fn a_ground_of_another_colour() {
+    // Piece and ground are of the same brightness on the average of the channels.
+    let (coverage, necks) = scene(Camera { shape_level: 255.0, ground_level: 0.0, noise: 0.0, ..Camera::default() });
+    for (shape, ground) in
+        [([180, 90, 60], [60, 90, 180]), ([200, 190, 120], [30, 120, 60]), ([90, 90, 90], [20, 160, 90])]
+    {
+        let mut pixels = Vec::with_capacity(3 * coverage.len());
+        for c in &coverage {
+            let mix = |k: usize| (ground[k] * (255 - i32::from(*c)) + shape[k] * i32::from(*c)) / 255;
+            pixels.extend([0, 1, 2].map(|k| mix(k) as u8));
+        }
+        let frame = Frame::rgb(SIDE as u32, SIDE as u32, &pixels).unwrap();
+        check(&segment(&frame, &Parameters::default()), &necks, &format!("{shape:?} on {ground:?}"));
+    }
+}
+
+#[test]
+fn specks_and_hairs() {
+    let (mut pixels, necks) = scene(Camera { noise: 3.0, ..Camera::default() });
+    for (k, (x, y)) in
+        [(440.0, 100.0), (60.0, 450.0), (445.0, 455.0), (850.0, 440.0), (430.0, 840.0)].into_iter().enumerate()
+    {
+        disc(&mut pixels, (x, y), 2.0 + 2.5 * k as f64, |_, _| 50);
+    }
+    // A hair of three pixels, bent, across the gap between the pieces.
+    for i in 0..110 {
+        let (x, y) = (i + 410, (380.0 + i as f64 + 6.0 * (i as f64 / 20.0).sin()) as usize);
+        for v in y..y + 3 {
+            pixels[v * SIDE + x..v * SIDE + x + 3].fill(60);
+        }
+    }
+    let found = grey(&pixels);
+    check(&found, &necks, "specks");
+    assert!(found.rejected.iter().any(|r| r.reason == Reason::Small), "{:?}", found.rejected);
+    assert!(found.rejected.iter().any(|r| r.reason == Reason::Thread), "{:?}", found.rejected);
+}
+
+#[test]
+fn a_piece_that_the_frame_cuts_is_named() {
+    let outlines: Vec<_> = [(230.0, 240.0), (650.0, 220.0), (240.0, 660.0), (880.0, 650.0)]
+        .into_iter()
+        .enumerate()
+        .map(|(k, (x, y))| Piece::random(SIZE, 10 + k as u64).outline(&pose(0.3, 1.0, x, y)))
+        .collect();
+    let camera = Camera { width: SIDE, height: SIDE, noise: 3.0, ..Camera::default() };
+    let found = grey(&camera.picture(&outlines));
+    assert_eq!(found.cutouts.len(), 3);
+    assert_eq!(found.rejected.iter().map(|r| r.reason).collect::<Vec<_>>(), [Reason::CutByFrame]);
+}
+
+#[test]
+fn two_pieces_that_touch_are_named() {
+    let mut reasons = Vec::new();
+    for gap in [40.0, -3.0, -8.0] {
+        // The tab of the left one points at the flat side of the right one.
+        let usual = Piece::usual(SIZE);
+        let mut left = Piece { sides: [None; 4], ..usual.clone() };
+        left.sides[1] = usual.sides[0];
+        let right = Piece { sides: [usual.sides[0], usual.sides[1], None, None], ..usual.clone() };
+        let tab = left.sides[1].unwrap().1;
+        let reach = SIZE + tab.height + tab.head + gap;
+        let single = Piece::random(SIZE, 3);
+        let outlines = [
+            left.outline(&pose(0.0, 1.0, 200.0, 250.0)),
+            right.outline(&pose(0.0, 1.0, 200.0 + reach, 250.0)),
+            single.outline(&pose(0.4, 1.0, 230.0, 680.0)),
+            single.outline(&pose(1.4, 1.0, 640.0, 680.0)),
+        ];
+        let camera = Camera { width: SIDE, height: SIDE, noise: 3.0, ..Camera::default() };
+        let found = grey(&camera.picture(&outlines));
+        reasons.push((found.cutouts.len(), found.rejected.iter().map(|r| r.reason).collect::<Vec<_>>()));
+    }
+    assert_eq!(reasons, [(4, vec![]), (2, vec![Reason::Touching]), (2, vec![Reason::Touching])]);
+}
