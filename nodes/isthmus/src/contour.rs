@@ -549,27 +549,27 @@ impl Picture for Raw<'_> {
 }
 
 impl Raw<'_> {
-    /// The stretches of rows that are not on one side of the level as a whole.
+    /// The stretches of rows in which ground is followed by shape, and a few more.
     fn spans(&self, level: f32, sense: f32, spans: &mut Vec<Span>) {
         /// Pixels that are looked at together: most of a row is uniform.
-        const CHUNK: usize = 32;
+        const CHUNK: usize = 16;
         // Beyond the levels of a byte, one step further is as good as any.
         let bright = sense > 0.0;
         let bound = if bright { level.floor() } else { level.ceil() }.clamp(-1.0, 256.0) as i16;
         for (y, row) in self.pixels.chunks_exact(self.width).enumerate() {
-            let mut before = 0;
+            let mut before = false;
             for (k, chunk) in row.chunks(CHUNK).enumerate() {
                 let inside: u8 = if bright {
                     chunk.iter().map(|&p| u8::from(i16::from(p) > bound)).sum()
                 } else {
                     chunk.iter().map(|&p| u8::from(i16::from(p) < bound)).sum()
                 };
-                let all = if usize::from(inside) == chunk.len() { 2 } else { u8::from(inside > 0) };
-                if all == 1 || all != before {
+                let all = usize::from(inside) == chunk.len();
+                if inside > 0 && !(all && before) {
                     spans.push(Span { y, start: k * CHUNK, end: k * CHUNK + chunk.len() });
                 }
-                // After a mixed stretch the next one is looked at whatever it holds.
-                before = all;
+                before =
+                    all || chunk.last().is_some_and(|&p| (i16::from(p) > bound) == bright && i16::from(p) != bound);
             }
         }
     }

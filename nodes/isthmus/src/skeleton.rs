@@ -80,6 +80,8 @@ pub struct Triangulation {
     pub(crate) discs: Vec<SkeletonPoint>,
     /// Which side of the border each triangle is on.
     pub(crate) polarity: Vec<Polarity>,
+    /// Whether each side is a way from one disc to the next, rather than a step of the border (or across it).
+    passage: Vec<bool>,
     points: Vec<delaunator::Point>,
     /// Diagonal of the border's bounding box.
     pub(crate) extent: f64,
@@ -168,6 +170,19 @@ impl Triangulation {
             let inside = (twice_area > 0.0) == ascending;
             self.polarity.push(if inside { Polarity::Positive } else { Polarity::Negative });
         }
+        let mut flags = std::mem::take(&mut self.passage);
+        flags.clear();
+        let passage = |side: usize| {
+            let [i, j] = self.corner_pair(side);
+            let step = i.abs_diff(j);
+            let there = match self.neighbours[side] {
+                NO_NEIGHBOUR => Polarity::Negative,
+                neighbour => self.polarity[neighbour / 3],
+            };
+            self.polarity[side / 3] == there && step != 1 && step != count - 1
+        };
+        flags.extend((0..self.corners.len()).map(passage));
+        self.passage = flags;
         Ok(())
     }
 
@@ -209,13 +224,7 @@ impl Triangulation {
 
     /// Whether a side is a way from one disc to the next, or a step of the border itself (or crosses it).
     pub(crate) fn is_passage(&self, side: usize) -> bool {
-        let [i, j] = self.corner_pair(side);
-        let step = i.abs_diff(j);
-        let there = match self.neighbours[side] {
-            NO_NEIGHBOUR => Polarity::Negative,
-            neighbour => self.polarity[neighbour / 3],
-        };
-        self.polarity[side / 3] == there && step != 1 && step != self.points.len() - 1
+        self.passage[side]
     }
 
     /// The triangle beyond a side; `None` where the outer world begins: over the hull, and at discs larger than the shape,

@@ -16,16 +16,41 @@ pub(super) struct Blocks {
     pub(super) rows: usize,
     /// One plane for a grey frame, three for a colour one.
     pub(super) planes: Vec<Vec<f32>>,
+    /// The blocks that are looked at to find the ground, all over the frame.
+    samples: Vec<Sample>,
     sums: Vec<u16>,
 }
 
 impl Blocks {
+    /// Chooses the blocks that are looked at to find the ground.
+    fn choose_samples(&mut self) {
+        let (columns, rows) = (self.columns, self.rows);
+        let step = ((columns * rows) as f64 / SAMPLES as f64).sqrt().round().max(1.0) as usize;
+        // Frames of a few rows are looked at all along.
+        let (across, down) = if rows < step {
+            (step, 1)
+        } else if columns < step {
+            (1, step)
+        } else {
+            (step, step)
+        };
+        self.samples.clear();
+        for row in (0..rows).step_by(down) {
+            // Each row begins elsewhere, so that narrow upright shapes are hit as well.
+            let from = if columns > across { row / down % across } else { 0 };
+            for column in (from..columns).step_by(across) {
+                self.samples.push(Sample { block: row * columns + column, column, row });
+            }
+        }
+    }
+
     pub(super) fn fill(&mut self, frame: &Frame<'_>) {
         let channels = frame.format.channels();
         let (width, height) = (frame.width, frame.height);
         self.size = block_size(width.min(height));
         self.columns = width.div_ceil(self.size);
         self.rows = height.div_ceil(self.size);
+        self.choose_samples();
         self.planes.resize_with(channels, Vec::new);
         for plane in &mut self.planes {
             plane.clear();
@@ -90,7 +115,9 @@ impl Surface {
 
     /// Level at a block.
     pub(super) fn at(&self, column: f64, row: f64) -> f32 {
-        self.coefficients.dot(&Self::basis(self.scale, column, row)) as f32
+        let c = &self.coefficients;
+        let (u, v) = (column * self.scale[0] - 1.0, row * self.scale[1] - 1.0);
+        (c[0] + v * (c[2] + v * c[5]) + u * (c[1] + v * c[4] + u * c[3])) as f32
     }
 
     /// Levels along a row, from a column in steps.
@@ -124,7 +151,7 @@ const MIN_RESIDUAL: f32 = 6.0;
 /// dark print on black more.
 const MIN_RELATIVE_RESIDUAL: f32 = 0.12;
 /// Blocks that are looked at to find the ground: a shape of a thousandth of the frame still has a dozen among them.
-const SAMPLES: usize = 12_000;
+const SAMPLES: usize = 10_000;
 /// Blocks used for the fit: more do not make a quadratic any better.
 const FIT_SAMPLES: usize = 2_000;
 /// Rounds of fitting the ground and asking again what belongs to it.
@@ -138,15 +165,16 @@ const SURE_SHARE: f64 = 0.62;
 
 /// A class of blocks taken for ground.
 pub(super) struct Candidate {
-    /// Whether each block of [`samples`] is ground.
+    /// Whether each block of [`Blocks::samples`] is ground.
     is_ground: Vec<bool>,
 }
 
-/// Indices of the blocks that are looked at to find the ground, all over the frame.
-fn samples(blocks: &Blocks) -> impl Iterator<Item = usize> + Clone {
-    let count = blocks.columns * blocks.rows;
-    // An odd step does not fall on the same columns row after row.
-    (0..count).step_by((count / SAMPLES) | 1)
+/// A block that is looked at.
+#[derive(Debug, Clone, Copy)]
+struct Sample {
+    block: usize,
+    column: usize,
+    row: usize,
 }
 
 /// What tells ground and shapes apart.
@@ -185,7 +213,7 @@ pub(super) fn candidates(blocks: &Blocks) -> Vec<Candidate> {
     let best = channels
         .iter()
         .map(|channel| {
-            let values: Vec<f32> = samples(blocks).map(|k| channel.at(planes, k)).collect();
+            let values: Vec<f32> = blocks.samples.iter().map(|s| channel.at(planes, s.block)).collect();
             let split = otsu(&values);
             (channel, values, split)
         })
@@ -221,13 +249,13 @@ pub(super) fn fit(blocks: &Blocks, candidate: Candidate) -> Ground {
     let mut residuals = Vec::with_capacity(is_ground.len());
     for _ in 0..ROUNDS {
         ground.surfaces = blocks.planes.iter().map(|plane| fit_surface(blocks, plane, &is_ground)).collect();
-        let residual = |k: usize| {
-            let (column, row) = ((k % blocks.columns) as f64, (k / blocks.columns) as f64);
+        let residual = |s: &Sample| {
             let channels = blocks.planes.iter().zip(&ground.surfaces);
-            channels.map(|(plane, surface)| (plane[k] - surface.at(column, row)).abs()).fold(0.0, f32::max)
+            let (column, row) = (s.column as f64, s.row as f64);
+            channels.map(|(plane, surface)| (plane[s.block] - surface.at(column, row)).abs()).fold(0.0, f32::max)
         };
         residuals.clear();
-        residuals.extend(samples(blocks).map(residual));
+        residuals.extend(blocks.samples.iter().map(residual));
         let scatter: Vec<f32> = residuals.iter().zip(&is_ground).filter(|(_, g)| **g).map(|(r, _)| *r).collect();
         // The median of absolute residuals is 0.67 standard deviations.
         let sigma = median(scatter) / 0.6745;
@@ -265,14 +293,13 @@ fn fit_surface(blocks: &Blocks, plane: &[f32], is_ground: &[bool]) -> Surface {
     let scale = [blocks.columns, blocks.rows].map(|n| 2.0 / (n.max(2) - 1) as f64);
     let total = is_ground.iter().filter(|g| **g).count();
     let stride = (total / FIT_SAMPLES).max(1);
-    let samples: Vec<(Vector6<f64>, f64)> = samples(blocks)
+    let samples: Vec<(Vector6<f64>, f64)> = blocks
+        .samples
+        .iter()
         .zip(is_ground)
         .filter(|(_, is_ground)| **is_ground)
         .step_by(stride)
-        .map(|(k, _)| {
-            let (column, row) = (k % blocks.columns, k / blocks.columns);
-            (Surface::basis(scale, column as f64, row as f64), f64::from(plane[k]))
-        })
+        .map(|(s, _)| (Surface::basis(scale, s.column as f64, s.row as f64), f64::from(plane[s.block])))
         .collect();
     let level = f64::from(median(samples.iter().map(|s| s.1 as f32).collect()));
     let mut surface = Surface { coefficients: Vector6::new(level, 0.0, 0.0, 0.0, 0.0, 0.0), scale };
