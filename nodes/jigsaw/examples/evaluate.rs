@@ -7,7 +7,7 @@
 use anyhow::{Context, bail};
 use isthmus::{Point, mask};
 use jigsaw::generate::{Cut, Options, Puzzle, Rim};
-use jigsaw::{Params, Piece, Policy, Solver};
+use jigsaw::{Assembly, Params, Piece, Policy, Solver};
 use nalgebra::Vector2;
 use rayon::prelude::*;
 use std::time::Instant;
@@ -36,6 +36,8 @@ fn cases() -> Vec<Case> {
         case("alike95", Options { similarity: 0.95, noise: 10.0, blur: 2.0, ..grid(4, 6) }),
         case("alike98", Options { similarity: 0.98, ..grid(4, 6) }),
         case("alike98_8x12", Options { similarity: 0.98, ..small(8, 12) }),
+        case("twins", Options { similarity: 0.99, noise: 20.0, blur: 4.0, ..small(4, 6) }),
+        case("clones", Options { similarity: 0.995, noise: 20.0, blur: 4.0, ..small(4, 6) }),
         case("missing3", Options { missing: 3, ..grid(4, 6) }),
         case("missing5", Options { missing: 5, ..grid(4, 6) }),
         case("twice3", Options { duplicate: 3, ..grid(4, 6) }),
@@ -81,6 +83,9 @@ fn pieces(puzzle: &Puzzle, frames: bool) -> anyhow::Result<Vec<Piece>> {
         .collect()
 }
 
+/// Lower bounds of the classes in which confidences are counted.
+const BINS: [f64; 7] = [0.0, 0.5, 0.6, 0.8, 0.9, 0.95, 0.99];
+
 /// Middle of a piece's border points.
 fn centroid(piece: &Piece) -> Point {
     let points = &piece.features.border.points;
@@ -91,6 +96,7 @@ fn main() -> anyhow::Result<()> {
     let mut names = Vec::new();
     let mut seeds = 1..4u64;
     let mut verbose = false;
+    let mut bins = [(0, 0); BINS.len()];
     let mut params = Params::default();
     let mut arguments = std::env::args().skip(1);
     let cases = cases();
@@ -167,6 +173,12 @@ fn main() -> anyhow::Result<()> {
             if params.policy == Policy::Paper {
                 println!("{:?}", assembly.table);
             }
+            for m in &assembly.matings {
+                let alone = Assembly { matings: vec![m.clone()], ..assembly.clone() };
+                let bin = BINS.iter().rposition(|b| m.confidence >= *b).unwrap_or(0);
+                bins[bin].0 += puzzle.score(&pieces, &alone).right_matings;
+                bins[bin].1 += 1;
+            }
             if verbose && !s.is_perfect() {
                 let mut placements = assembly.placements.clone();
                 placements.sort_by(|p, q| p.component.cmp(&q.component).then(p.piece.cmp(&q.piece)));
@@ -182,6 +194,10 @@ fn main() -> anyhow::Result<()> {
                 }
             }
         }
+    }
+    println!("matings by confidence:");
+    for (from, (right, all)) in BINS.iter().zip(bins) {
+        println!("  from {from:.4}: {right} of {all} right");
     }
     Ok(())
 }

@@ -27,6 +27,9 @@ const UNREFINED_OVERLAP: f64 = 0.05;
 const LOOSE: Tolerance = Tolerance { position: 0.04, angle: 0.05 };
 /// A closure this many times the typical one is no closure.
 const CLOSURE_FACTOR: f64 = 5.0;
+/// So many loops tell a puzzle's closures from chance if their median error is at most this part of the loose
+/// tolerance: true closures crowd near zero, chance ones spread over the whole of it (median near 0.7).
+const CROWD: (usize, f64) = (4, 0.4);
 /// Tolerance never tighter than this: below it only the noise of the noise is measured.
 const TIGHT: Tolerance = Tolerance { position: 0.003, angle: 0.003 };
 /// Pose agreement of candidates with an island that has been adjusted.
@@ -45,6 +48,8 @@ const STRAY_SHARE: usize = 4;
 const FINAL_ROUNDS: usize = 2;
 /// Candidates of each mouth (and tab) that take part in loops: more and chance loops drown the true ones.
 const LOOP_RANKS: usize = 6;
+/// The same for the loops by which the puzzle is calibrated.
+const FIRST_RANKS: usize = 2;
 /// Candidates of each mouth and tab that take part in growth.
 const GROWTH_RANKS: usize = 12;
 /// Rounds of verification and growth at most: a contradiction that comes back each time stays out.
@@ -250,7 +255,28 @@ impl Assembler<'_> {
         self.reconcile();
         self.improve();
         self.refine_all(FINAL_ROUNDS, FINE);
-        self.finish(joints)
+        self.finish_sure(joints)
+    }
+
+    /// The outcome without the pieces and matings that are less sure than asked for.
+    fn finish_sure(&mut self, joints: &[Joint]) -> Outcome {
+        let least = self.params.minimum_confidence;
+        let mut outcome = self.finish(joints);
+        // Each round takes something out, so there are no more rounds than pieces and matings.
+        for _ in 0..self.outlines.len() + self.state.joined.len() {
+            let unsure: Vec<usize> = (0..self.outlines.len())
+                .filter(|k| outcome.poses[*k].is_some() && outcome.confidence[*k] < least)
+                .collect();
+            let weak: Vec<usize> = outcome.matings.iter().filter(|m| m.1 < least).map(|m| m.0).collect();
+            let joined: Vec<usize> = weak.into_iter().filter(|k| self.state.joined.contains(k)).collect();
+            if unsure.is_empty() && joined.is_empty() {
+                break;
+            }
+            self.detach(&unsure, &joined);
+            outcome = self.finish(joints);
+        }
+        outcome.matings.retain(|m| m.1 >= least);
+        outcome
     }
 
     /// The paper's assembly: down the ranked table, mating whatever fits without intolerable overlap; when pieces are
@@ -293,7 +319,7 @@ impl Assembler<'_> {
         }
         let trusted = self.state.joined.clone();
         self.learn(&trusted);
-        self.finish(joints)
+        self.finish_sure(joints)
     }
 
     fn late(&mut self) -> bool {
@@ -313,14 +339,14 @@ impl Assembler<'_> {
     fn close_loops(&mut self, joints: &[Joint]) -> Vec<loops::Loop> {
         let mut tolerance = LOOSE;
         let active = self.active();
-        let best: Vec<usize> =
-            active.iter().copied().filter(|k| self.edges[*k].mouth_rank < 2 && self.edges[*k].tab_rank < 2).collect();
+        let low = |e: &Edge| e.mouth_rank < FIRST_RANKS && e.tab_rank < FIRST_RANKS;
+        let best: Vec<usize> = active.iter().copied().filter(|k| low(&self.edges[*k])).collect();
         let first = loops::find(&self.edges, &best, self.outlines, tolerance);
-        // Enough loops to tell the crowd at zero from chance.
-        const ENOUGH: usize = 4;
-        if self.params.recalibrate && first.len() >= ENOUGH {
-            let mut errors: Vec<f64> = first.iter().map(|l| l.error).collect();
-            let typical = median(&mut errors).unwrap_or(1.0);
+        let typical = median(&mut first.iter().map(|l| l.error).collect::<Vec<f64>>()).unwrap_or(1.0);
+        if self.params.recalibrate && (first.len() < CROWD.0 || typical > CROWD.1) {
+            return self.outstanding_loops(first);
+        }
+        if self.params.recalibrate {
             let factor = (CLOSURE_FACTOR * typical).min(1.0);
             tolerance.position = (LOOSE.position * factor).max(TIGHT.position);
             tolerance.angle = (LOOSE.angle * factor).max(TIGHT.angle);
@@ -338,7 +364,19 @@ impl Assembler<'_> {
             };
         }
         let active = self.active();
-        let mut found = loops::find(&self.edges, &active, self.outlines, tolerance);
+        let found = loops::find(&self.edges, &active, self.outlines, tolerance);
+        self.sorted(found)
+    }
+
+    /// Loops of so few or so loose ones that they may be chance: those whose candidates lead their rivals as well.
+    fn outstanding_loops(&mut self, found: Vec<loops::Loop>) -> Vec<loops::Loop> {
+        let lead = |l: &loops::Loop| l.edges.iter().map(|k| self.lead(*k)).sum::<f64>();
+        let (kept, _) = found.into_iter().partition(|l| lead(l) >= ACCEPT);
+        self.sorted(kept)
+    }
+
+    /// Counts what supports what, and puts the best loops first.
+    fn sorted(&mut self, mut found: Vec<loops::Loop>) -> Vec<loops::Loop> {
         for l in &found {
             for &k in &l.edges {
                 self.edges[k].support += 1;
