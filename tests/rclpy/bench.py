@@ -72,29 +72,44 @@ class Camera:
     def take(self, features):
         self.features.setdefault(features.header.stamp.sec, []).append(features)
 
-    def show(self, message, attempts=5):
-        """Publishes until the features of the frame come back; gives them."""
+    def show(self, message, attempts=5, seen=None):
+        """Publishes until the features of the frame come back (or `seen` gives something true); gives them."""
         second = message.header.stamp.sec
+        seen = seen or (lambda: self.features.get(second))
         self.ros.until(lambda: self.publisher.get_subscription_count() > 0, f"listener on {self.publisher.topic_name}")
         for attempt in range(attempts):
             self.publisher.publish(message)
             self.sent += 1
             last = attempt == attempts - 1
-            if self.ros.until(lambda: self.features.get(second), f"features of frame {second}", 5, required=last):
-                return self.features[second]
+            if evidence := self.ros.until(seen, f"sign of frame {second}", 5, required=last):
+                return evidence
 
     def show_puzzle(self, puzzle, make=image_message, **options):
         """Shows every frame; gives the truth of each piece by the id that the cell gave it."""
         truth = {}
-        for second, piece in enumerate(puzzle.truth["pieces"], start=1):
-            with Picture.open(puzzle.folder / piece["source"]) as picture:
-                grey = numpy.asarray(picture.convert("L"))
-            features = self.show(make(grey, Time(sec=second, nanosec=500), **options))
+        for piece, grey, stamp in stamped_frames(puzzle):
+            features = self.show(make(grey, stamp, **options))
             assert len(features) == 1, f"{piece['source']} holds one piece, the cell saw {len(features)}"
             assert features[0].header.frame_id == "camera"
-            assert features[0].header.stamp.nanosec == 500
+            assert features[0].header.stamp.nanosec == stamp.nanosec
             truth[features[0].id] = TruePiece(piece, grey.shape[1], grey.shape[0])
         return truth
+
+    def show_puzzle_to_composed_cell(self, puzzle, arm):
+        """As `show_puzzle`, where the features stay inside a process: the assembly tells which pieces were seen."""
+        truth = {}
+        for piece, grey, stamp in stamped_frames(puzzle):
+            name = f"{stamp.sec}_{stamp.nanosec:09}"
+            self.show(image_message(grey, stamp), seen=lambda name=name: arm.knows(name))
+            truth[name] = TruePiece(piece, grey.shape[1], grey.shape[0])
+        return truth
+
+
+def stamped_frames(puzzle):
+    """Every piece of a puzzle with its frame and a stamp of its own."""
+    for second, piece in enumerate(puzzle.truth["pieces"], start=1):
+        with Picture.open(puzzle.folder / piece["source"]) as picture:
+            yield piece, numpy.asarray(picture.convert("L")), Time(sec=second, nanosec=500)
 
 
 @dataclass
@@ -150,6 +165,10 @@ class Arm:
 
     def take(self, message):
         self.transforms.update((transform.child_frame_id, transform) for transform in message.transforms)
+
+    def knows(self, name):
+        """Whether some assembly so far has heard of a piece, placed or not."""
+        return any(name in assembly.unplaced or name in {p.id for p in assembly.pieces} for assembly in self.assemblies)
 
     def complete(self, pieces, timeout=60):
         """Waits for the complete assembly and its transforms; gives the assembly."""

@@ -112,13 +112,13 @@ def test_topics_of_any_type_are_recorded_from_rclpy(launcher, ros, tmp_path):
     twist.angular.z = 0.25
     sent = {"/assembly": assembly, "/cmd_vel": twist}
     node = ros.node("talker")
-    publishers = {topic: node.create_publisher(type(message), topic, 10) for topic, message in sent.items()}
+    publishers = {topic: node.create_publisher(type(message), topic, MESSAGES) for topic, message in sent.items()}
     recorder = launcher.start("jigsaw", "bag", "record", bag, "--topics", *sent)
     ros.until(lambda: all(p.get_subscription_count() for p in publishers.values()), "recorder on every topic")
     for topic, publisher in publishers.items():
         for _ in range(MESSAGES):
             publisher.publish(sent[topic])
-            assert publisher.wait_for_all_acked()
+        assert publisher.wait_for_all_acked()
     assert recorder.stop() == 0, recorder.text()
 
     recorded = read_with_rosbags(bag)
