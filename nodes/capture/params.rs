@@ -39,10 +39,11 @@ pub const SAME_PLACE_OVERLAP: Spec = Spec {
 /// Reliability of the subscription of compressed frames.
 pub const COMPRESSED_RELIABILITY: Spec = Spec {
     name: "compressed_reliability",
-    default: Default::Text("reliable"),
+    default: Default::Text("any"),
     unit: "",
-    rule: Rule::OneOf(&["reliable", "best_effort"]),
-    description: "Quality of service asked for on image/compressed; best_effort for a camera that offers no more.",
+    rule: Rule::OneOf(&["any", "reliable", "best_effort"]),
+    description: "Quality of service asked for on image/compressed; any hears every camera, the frames of a reliable \
+                  one twice over the network.",
     read_only: true,
 };
 
