@@ -7,6 +7,7 @@ use std::cell::RefCell;
 use std::collections::{HashMap, HashSet};
 use std::rc::Rc;
 use std::sync::{Arc, Mutex, PoisonError};
+use std::time::Duration;
 
 use futures::channel::{mpsc, oneshot};
 use futures::{SinkExt, StreamExt};
@@ -24,6 +25,13 @@ use super::topics::{SERVICE_QOS, Topic};
 /// Messages that may wait between the middleware and a node's loop. Few: what waits further out waits in the
 /// middleware's cache, whose depth is the topic's.
 pub const CHANNEL_DEPTH: usize = 4;
+
+/// How long the first answer to a client waits. A request may come before the middleware has met the client's reader
+/// of answers, and an answer that is written then is lost; on loopback they meet within about 0.1 s.
+const INTRODUCTION: Duration = Duration::from_millis(150);
+
+/// Clients remembered as met; beyond, memory is bounded by forgetting them, which costs each another introduction.
+const MOST_CLIENTS: usize = 1024;
 
 /// Why a node could not be opened.
 #[derive(Debug, thiserror::Error)]
@@ -247,6 +255,7 @@ impl Session {
         let executor = Rc::clone(&self.executor);
         self.spawn(async move {
             let mut requests = server.receive_request_stream();
+            let mut clients = HashSet::new();
             while let Some(request) = requests.next().await {
                 let (id, request) = match request {
                     Ok((id, Wire(request))) => (id, request),
@@ -260,9 +269,17 @@ impl Session {
                     break;
                 }
                 let (server, health, name) = (Rc::clone(&server), Arc::clone(&health), name.clone());
+                if clients.len() >= MOST_CLIENTS {
+                    clients.clear();
+                }
+                let introduction = clients.insert(id.writer_gid).then(|| smol::Timer::after(INTRODUCTION));
                 executor
                     .spawn(async move {
-                        if let Ok(answer) = answer.await
+                        let answer = answer.await;
+                        if let Some(introduction) = introduction {
+                            introduction.await;
+                        }
+                        if let Ok(answer) = answer
                             && let Err(e) = server.async_send_response(id, Wire(answer)).await
                         {
                             health.warn("write", &format!("the answer of {name} was not written: {e}"));

@@ -389,7 +389,8 @@ impl Segmenter {
         let plain = levels.uniform && frame.format == PixelFormat::Grey;
         if plain {
             crop.ground_level = levels.ground;
-            crop.shape_level = levels.ground + levels.sense * levels.contrast;
+            // A sum of rounded numbers; a level is one of the 8-bit scale.
+            crop.shape_level = (levels.ground + levels.sense * levels.contrast).clamp(0.0, 255.0);
         } else if levels.uniform {
             (crop.shape_level, crop.ground_level) = (levels.contrast, 0.0);
         } else {
