@@ -233,12 +233,23 @@ pub const MIN_REPORTED_AREA: usize = 64;
 
 /// Pixels of ground round a shape in its cutout: room for the blur that the contour may need.
 const MARGIN: usize = 8;
-/// Levels of shape and ground in a cutout that had to be divided by the local contrast: the room above and below keeps
-/// noise from being clipped.
-const DIVIDED_LEVELS: [f32; 2] = [200.0, 50.0];
-/// Most spread of the shape's level (between its quartiles), as a part of the contrast, at which the pixels are cut out as
-/// they are: the contour half-way moves by a twentieth of the edge's blur at most.
-const UNIFORM: f32 = 0.12;
+/// Greatest contrast of a cutout that had to be divided by the local contrast, in grey levels: shape and ground keep some room.
+const MAX_DIVIDED_CONTRAST: f32 = 180.0;
+/// Standard deviations of noise for which there is room beyond the levels of such a cutout: clipping is a bias.
+const DIVIDED_ROOM: f32 = 4.0;
+/// Most spread of the shape's level (between its quartiles, noise aside), as a part of the contrast, at which the pixels are cut out
+/// as they are: the contour half-way moves by a thirtieth of the edge's blur at most.
+const UNIFORM: f32 = 0.06;
+/// Most difference of the ground's level round a shape, as a part of the contrast, at which the pixels are cut out as they are.
+const UNIFORM_GROUND: f32 = 0.06;
+/// Depth of the blocks all of whose neighbours belong to the shape.
+const INNER_DEPTH: u8 = 2;
+/// Greatest depth that is told apart, in blocks: beyond the blur of any edge worth measuring.
+const MAX_DEPTH: u8 = 7;
+/// The blur of the edge is left behind where the median level of blocks is this part of that of the blocks next deeper.
+const SETTLED: f32 = 0.985;
+/// Most noise of the map of local contrasts, as a part of the contrast: it moves the contour by a hundredth of the edge's blur.
+const MAP_NOISE: f32 = 0.004;
 /// A shape alone in the frame may touch the edges if it spans this part of the frame in both directions: then the frame
 /// was cropped to the shape.
 const TIGHT_SPAN: f64 = 0.9;
@@ -246,8 +257,8 @@ const TIGHT_SPAN: f64 = 0.9;
 const TIGHT_CONTACT: f64 = 0.6;
 /// ... and has this part of all the area that stands out.
 const TIGHT_SHARE: f64 = 0.9;
-/// How many blocks beyond the inner blocks of a shape its levels matter: the border runs through the first or second.
-const BORDER_BLOCKS: usize = 4;
+/// How many blocks beyond its border a shape's levels matter: the blur of its edge, and the interpolation.
+const BORDER_BLOCKS: usize = 3;
 /// Most differences of neighbouring pixels looked at to measure the noise: beyond, the figure gets no better.
 const NOISE_SAMPLES: usize = 4_000;
 /// Blocks of a shape looked at to measure its levels, roughly: beyond, medians get no better.
@@ -394,7 +405,10 @@ impl Segmenter {
         } else if levels.uniform {
             (crop.shape_level, crop.ground_level) = (levels.contrast, 0.0);
         } else {
-            [crop.shape_level, crop.ground_level] = DIVIDED_LEVELS;
+            // Half the contrast and the room above it fill half the scale.
+            let noise = ground.scatter * block as f32 / levels.contrast.max(f32::MIN_POSITIVE);
+            let contrast = (127.5 / (0.5 + DIVIDED_ROOM * noise)).min(MAX_DIVIDED_CONTRAST);
+            (crop.shape_level, crop.ground_level) = (127.5 + contrast / 2.0, 127.5 - contrast / 2.0);
         }
         let ground_pixel = crop.ground_level.round().clamp(0.0, 255.0) as u8;
         crop.pixels.clear();
@@ -432,83 +446,126 @@ impl Segmenter {
     fn levels(&self, ground: &Ground, k: usize) -> Levels {
         let c = self.coarse.list[k];
         let columns = self.blocks.columns;
-        let inside = |column: usize, row: usize| -> bool {
-            // A block all of whose neighbours belong to the component, those beyond the frame included.
-            (row.saturating_sub(1)..self.blocks.rows.min(row + 2)).all(|r| {
-                (column.saturating_sub(1)..columns.min(column + 2)).all(|c| {
-                    self.owner[r * columns + c] == k as u32 && ground.residual[r * columns + c] > ground.threshold
-                })
-            })
+        let surface = |column: usize, row: usize| -> f32 {
+            ground.surfaces.first().map_or(0.0, |s| s.at(column as f64, row as f64))
         };
-        let (width, height) = (c.right - c.left, c.bottom - c.top);
-        let mut list = Vec::new();
-        let mut signed = Vec::new();
-        let mut look_at = |step: usize, inner: bool| {
-            for row in (c.top..c.bottom).step_by(step) {
-                for column in (c.left..c.right).step_by(step) {
-                    let block = row * columns + column;
-                    if self.owner[block] == k as u32 && (!inner || inside(column, row)) {
-                        list.push(ground.residual[block]);
-                        if let ([plane], [surface]) = (&self.blocks.planes[..], &ground.surfaces[..]) {
-                            signed.push(plane[block] - surface.at(column as f64, row as f64));
-                        }
-                    }
-                }
-            }
-            list.len()
-        };
-        let step = ((c.area / LEVEL_SAMPLES) as f64).sqrt() as usize;
-        let is_thin = look_at(step.max(1), true) == 0 && look_at(1, true) == 0;
-        if is_thin {
-            // Thinner than three blocks: the strongest blocks are the best there is.
-            look_at(1, false);
-            let top = quantile(&mut list, 0.9);
-            list = vec![top];
-        }
-        let middle = quantile(&mut list, 0.5);
-        let spread = quantile(&mut list, 0.75) - quantile(&mut list, 0.25);
-        let mixed = signed.iter().filter(|s| **s > 0.0).count();
-        let sense = if 2 * mixed >= signed.len() { 1.0 } else { -1.0 };
-        // A twentieth of the blocks may be specks or print.
-        let one_sided = !signed.is_empty() && mixed.min(signed.len() - mixed) * 20 <= signed.len();
-        let corner =
-            |column: usize, row: usize| ground.surfaces.first().map_or(0.0, |s| s.at(column as f64, row as f64));
-        let corners = [
-            corner(c.left, c.top),
-            corner(c.right, c.top),
-            corner(c.left, c.bottom),
-            corner(c.right, c.bottom),
-            corner((c.left + c.right) / 2, (c.top + c.bottom) / 2),
-        ];
+        let middle_block = ((c.left + c.right) / 2, (c.top + c.bottom) / 2);
+        let corners = [(c.left, c.top), (c.right, c.top), (c.left, c.bottom), (c.right, c.bottom), middle_block]
+            .map(|(column, row)| surface(column, row));
         let (low, high) = corners.iter().fold((f32::MAX, f32::MIN), |(l, h), v| (l.min(*v), h.max(*v)));
         let grey = self.blocks.planes.len() == 1;
-        let uniform = spread <= UNIFORM * middle && high - low <= UNIFORM * middle && (one_sided || !grey);
-        let ground_level = corners.iter().sum::<f32>() / corners.len() as f32;
-        let mut map = Vec::new();
-        if !uniform {
-            let blocks = (c.top..c.bottom).flat_map(|row| (c.left..c.right).map(move |column| (column, row)));
-            map.extend(blocks.map(|(column, row)| {
-                let block = row * columns + column;
-                let counts = self.owner[block] == k as u32 && inside(column, row);
-                if is_thin { middle } else { f32::from(u8::from(counts)) * ground.residual[block] }
-            }));
-        }
+        let step = (((c.area / LEVEL_SAMPLES) as f64).sqrt() as usize).max(1);
         let mut levels = Levels {
             left: c.left,
             top: c.top,
-            width,
-            height,
-            contrast: middle,
-            map,
-            uniform,
-            sense,
-            one_sided,
-            ground: ground_level,
+            width: c.right - c.left,
+            height: c.bottom - c.top,
+            ground: corners.iter().sum::<f32>() / corners.len() as f32,
+            ..Levels::default()
         };
-        if !uniform {
-            levels.spread_out(2.0 * ground.threshold);
+        // A block all of whose neighbours belong to the component, those beyond the frame included.
+        let inside = |column: usize, row: usize| -> bool {
+            (row.saturating_sub(1)..self.blocks.rows.min(row + 2))
+                .all(|r| (column.saturating_sub(1)..columns.min(column + 2)).all(|c| self.is_of(ground, k, c, r)))
+        };
+        let mut list = Vec::new();
+        let mut signed = Vec::new();
+        let blocks_in = |step: usize| {
+            (c.top..c.bottom).step_by(step).flat_map(move |r| (c.left..c.right).step_by(step).map(move |c| (c, r)))
+        };
+        for (column, row) in blocks_in(step).filter(|(column, row)| inside(*column, *row)) {
+            let block = row * columns + column;
+            list.push(ground.residual[block]);
+            if grey {
+                signed.push(self.blocks.planes[0][block] - surface(column, row));
+            }
+        }
+        levels.take_sense(&signed, grey);
+        levels.take_contrast(&mut list, ground.scatter);
+        levels.uniform &= high - low <= UNIFORM_GROUND * levels.contrast && (levels.one_sided || !grey);
+        if !list.is_empty() && levels.uniform {
+            return levels;
+        }
+        // The edge's blur reaches some blocks deep: the shape's own level is found beyond it.
+        let depths = self.depths(ground, k);
+        let settled = settled_depth(&depths, |i| {
+            ground.residual[(c.top + i / levels.width) * columns + c.left + i % levels.width]
+        });
+        list.clear();
+        let residual = blocks_in(1).map(|(column, row)| ground.residual[row * columns + column]);
+        levels.map.extend(residual.zip(&depths).map(|(r, depth)| if *depth >= settled { r } else { 0.0 }));
+        list.extend(levels.map.iter().filter(|r| **r > 0.0));
+        let is_thin = settled < INNER_DEPTH;
+        if is_thin {
+            // Thinner than three blocks: the strongest blocks are the best there is.
+            let top = quantile(&mut list, 0.9);
+            list = vec![top];
+        }
+        levels.take_contrast(&mut list, ground.scatter);
+        levels.uniform &= high - low <= UNIFORM_GROUND * levels.contrast && (levels.one_sided || !grey);
+        if levels.uniform || is_thin {
+            levels.map.fill(levels.contrast);
+        } else {
+            let noise = ground.scatter / levels.contrast.max(f32::MIN_POSITIVE);
+            levels.spread_out(2.0 * ground.threshold, usize::from(settled) + BORDER_BLOCKS, noise);
         }
         levels
+    }
+
+    /// Whether a block belongs to a coarse component itself, rather than to its surroundings.
+    fn is_of(&self, ground: &Ground, k: usize, column: usize, row: usize) -> bool {
+        let block = row * self.blocks.columns + column;
+        self.owner[block] == k as u32 && ground.residual[block] > ground.threshold
+    }
+
+    /// How many blocks deep within a coarse component each block of its box lies (1 along its border, 0 outside of it), up to
+    /// [`MAX_DEPTH`]; what lies beyond the frame counts as within.
+    fn depths(&self, ground: &Ground, k: usize) -> Vec<u8> {
+        let c = self.coarse.list[k];
+        let (width, height) = (c.right - c.left, c.bottom - c.top);
+        let mut depths = vec![0; width * height];
+        for run in self.coarse.runs.iter().filter(|run| run.label == k) {
+            for column in run.start..run.end {
+                if self.is_of(ground, k, column, run.row) {
+                    depths[(run.row - c.top) * width + column - c.left] = MAX_DEPTH;
+                }
+            }
+        }
+        let (left, top) = (c.left > 0, c.top > 0);
+        let (right, bottom) = (c.right < self.blocks.columns, c.bottom < self.blocks.rows);
+        // Distance along rows, columns and diagonals: one pass forward over the neighbours that come before, one back.
+        let relax = |depths: &mut [u8], x: usize, y: usize, sense: isize| {
+            let at = y * width + x;
+            if depths[at] == 0 {
+                return;
+            }
+            for (dx, dy) in [(-1, 0), (-1, -1), (0, -1), (1, -1)] {
+                let (u, v) = (x as isize + sense * dx, y as isize + sense * dy);
+                let open = (u < 0 && left)
+                    || (u >= width as isize && right)
+                    || (v < 0 && top)
+                    || (v >= height as isize && bottom);
+                let before = if open {
+                    0
+                } else if u < 0 || v < 0 || u >= width as isize || v >= height as isize {
+                    MAX_DEPTH
+                } else {
+                    depths[v as usize * width + u as usize]
+                };
+                depths[at] = depths[at].min(before + 1);
+            }
+        };
+        for y in 0..height {
+            for x in 0..width {
+                relax(&mut depths, x, y, 1);
+            }
+        }
+        for y in (0..height).rev() {
+            for x in (0..width).rev() {
+                relax(&mut depths, x, y, -1);
+            }
+        }
+        depths
     }
 
     /// Standard deviation of the grey levels of `self.crop`, from differences of neighbouring pixels, in shape and ground; the larger.
@@ -713,7 +770,25 @@ fn joins_two(cutout: &Cutout, area: f64) -> bool {
     })
 }
 
+/// The depth from which on blocks of a shape have its own level, the blur of its edge being left behind: the first whose median
+/// residual is nearly that of the next.
+fn settled_depth(depths: &[u8], residual: impl Fn(usize) -> f32) -> u8 {
+    let mut by_depth: [Vec<f32>; MAX_DEPTH as usize + 1] = Default::default();
+    for (i, depth) in depths.iter().enumerate().filter(|(_, depth)| **depth > 0) {
+        by_depth[usize::from(*depth)].push(residual(i));
+    }
+    let counts = by_depth.each_ref().map(Vec::len);
+    let most = counts.iter().max().copied().unwrap_or(0);
+    let medians = by_depth.map(median);
+    // Few blocks are no measure, and too few to learn local levels from.
+    let enough = |depth: u8| counts[usize::from(depth)] * 4 >= most;
+    let deepest = (1..=MAX_DEPTH).rev().find(|d| enough(*d)).unwrap_or(1);
+    let settled = |d: &u8| medians[usize::from(*d)] >= SETTLED * medians[usize::from(*d) + 1];
+    (INNER_DEPTH.min(deepest)..deepest).find(settled).unwrap_or(deepest)
+}
+
 /// Contrast of a coarse component against the ground.
+#[derive(Debug, Default)]
 struct Levels {
     left: usize,
     top: usize,
@@ -734,28 +809,51 @@ struct Levels {
 }
 
 impl Levels {
+    /// Takes the median of blocks' residuals for the contrast, and their spread, less what noise accounts for, for the
+    /// uniformity.
+    fn take_contrast(&mut self, list: &mut [f32], scatter: f32) {
+        /// Distance between the quartiles of a normal distribution, in standard deviations.
+        const QUARTILES: f32 = 1.349;
+        self.contrast = quantile(list, 0.5);
+        let spread = quantile(list, 0.75) - quantile(list, 0.25);
+        let excess = (spread.powi(2) - (QUARTILES * scatter).powi(2)).max(0.0).sqrt();
+        self.uniform = excess <= UNIFORM * self.contrast;
+    }
+
+    /// Whether the shape is brighter or darker than the ground, from blocks' signed residuals.
+    fn take_sense(&mut self, signed: &[f32], grey: bool) {
+        let brighter = signed.iter().filter(|s| **s > 0.0).count();
+        self.sense = if 2 * brighter >= signed.len() { 1.0 } else { -1.0 };
+        // A twentieth of the blocks may be specks or print.
+        self.one_sided = grey && !signed.is_empty() && brighter.min(signed.len() - brighter) * 20 <= signed.len();
+    }
+
     /// Spreads the levels of the inner blocks out over the box, each block taking the mean of its neighbours that have a level;
-    /// none stays below `least`.
-    fn spread_out(&mut self, least: f32) {
+    /// none stays below `least`. `noise` is the standard deviation of a block's level as a part of the contrast.
+    fn spread_out(&mut self, least: f32, reach: usize, noise: f32) {
         let (width, height) = (self.width, self.height);
+        let neighbours = move |k: usize| {
+            let (x, y) = (k % width, k / width);
+            (y.saturating_sub(1)..height.min(y + 2))
+                .flat_map(move |v| (x.saturating_sub(1)..width.min(x + 2)).map(move |u| v * width + u))
+        };
+        let mean = move |map: &[f32], k: usize| {
+            let known = neighbours(k).map(|k| map[k]).filter(|level| *level > 0.0);
+            let (sum, count) = known.fold((0.0, 0.0), |(sum, count), level| (sum + level, count + 1.0));
+            (count > 0.0).then(|| sum / count)
+        };
+        // Each round takes the mean of nine, and leaves a third of the deviation at most.
+        let mut left = noise;
+        while left > MAP_NOISE {
+            let map = std::mem::take(&mut self.map);
+            let smoothed = |k: usize| if map[k] > 0.0 { mean(&map, k).unwrap_or(map[k]) } else { 0.0 };
+            self.map = (0..map.len()).map(smoothed).collect();
+            left /= 3.0;
+        }
         let mut open: Vec<usize> = (0..self.map.len()).filter(|&k| self.map[k] == 0.0).collect();
-        for _ in 0..BORDER_BLOCKS {
-            let filled: Vec<(usize, f32)> = open
-                .iter()
-                .filter_map(|&k| {
-                    let (x, y) = (k % width, k / width);
-                    let (mut sum, mut count) = (0.0, 0.0);
-                    for v in y.saturating_sub(1)..height.min(y + 2) {
-                        for u in x.saturating_sub(1)..width.min(x + 2) {
-                            if self.map[v * width + u] > 0.0 {
-                                sum += self.map[v * width + u];
-                                count += 1.0;
-                            }
-                        }
-                    }
-                    (count > 0.0).then(|| (k, sum / count))
-                })
-                .collect();
+        for _ in 0..reach {
+            let filled: Vec<(usize, f32)> =
+                open.iter().filter_map(|&k| mean(&self.map, k).map(|level| (k, level))).collect();
             for (k, level) in filled {
                 self.map[k] = level;
             }
@@ -766,40 +864,53 @@ impl Levels {
         }
     }
 
-    /// Contrast at a pixel, between the blocks' centres.
-    fn at(&self, x: f32, y: f32) -> f32 {
-        let (u, v) = (x.clamp(0.0, (self.width - 1) as f32), y.clamp(0.0, (self.height - 1) as f32));
-        let (i, j) = (u as usize, v as usize);
-        let (i1, j1) = ((i + 1).min(self.width - 1), (j + 1).min(self.height - 1));
-        let (fu, fv) = (u - i as f32, v - j as f32);
-        let get = |i: usize, j: usize| self.map[j * self.width + i];
-        let top = get(i, j) + (get(i1, j) - get(i, j)) * fu;
-        let bottom = get(i, j1) + (get(i1, j1) - get(i, j1)) * fu;
-        top + (bottom - top) * fv
+    /// Fills `line` with the reciprocal contrast of the pixels of row `y` from column `from` on, between the blocks' centres.
+    fn fill_reciprocals(&self, block: usize, (y, from): (usize, usize), line: &mut [f32]) {
+        if self.uniform {
+            line.fill(1.0 / self.contrast.max(f32::MIN_POSITIVE));
+            return;
+        }
+        // Block k has its centre at pixel k * block + (block - 1) / 2.
+        let in_blocks = |pixel: usize| (pixel as f32 - (block - 1) as f32 / 2.0) / block as f32;
+        let row = (in_blocks(y) - self.top as f32).clamp(0.0, (self.height - 1) as f32);
+        let (j, t) = (row as usize, row.fract());
+        let upper = &self.map[j * self.width..][..self.width];
+        let lower = &self.map[(j + 1).min(self.height - 1) * self.width..][..self.width];
+        let reciprocal = |i: usize| 1.0 / (upper[i] + (lower[i] - upper[i]) * t);
+        // The column of a pixel is a whole number of blocks and one of few fractions.
+        let mut i = usize::MAX;
+        let (mut left, mut right) = (0.0, 0.0);
+        for (x, value) in line.iter_mut().enumerate() {
+            let column = (in_blocks(from + x) - self.left as f32).clamp(0.0, (self.width - 1) as f32);
+            let at = column as usize;
+            if at != i {
+                (left, right) = (reciprocal(at), reciprocal((at + 1).min(self.width - 1)));
+                i = at;
+            }
+            *value = left + (right - left) * (column - at as f32);
+        }
     }
 
     /// Fills a row of pixels with their difference from the ground, divided by the local contrast unless that is uniform.
     fn fill_row(&self, rows: &RowSource<'_>, (y, from): (usize, usize), out: &mut [u8], levels: [f32; 2]) {
         let RowSource { frame, ground, block } = *rows;
-        // Block k has its centre at pixel k * block + (block - 1) / 2.
         let in_blocks = |pixel: usize| (pixel as f64 - (block - 1) as f64 / 2.0) / block as f64;
         let channels = frame.format.channels();
         let source = &frame.row(y)[from * channels..];
         let mut difference = vec![0.0f32; out.len()];
-        let mut ground_levels = vec![0.0f32; out.len()];
+        let mut line = vec![0.0f32; out.len()];
         for (c, surface) in ground.surfaces.iter().enumerate() {
-            surface.fill_line(in_blocks(y), in_blocks(from), 1.0 / block as f64, &mut ground_levels);
-            for ((d, g), p) in difference.iter_mut().zip(&ground_levels).zip(source.iter().skip(c).step_by(channels)) {
+            surface.fill_line(in_blocks(y), in_blocks(from), 1.0 / block as f64, &mut line);
+            for ((d, g), p) in difference.iter_mut().zip(&line).zip(source.iter().skip(c).step_by(channels)) {
                 let signed = f32::from(*p) - g;
                 *d = if self.one_sided { self.sense * signed } else { d.max(signed.abs()) };
             }
         }
         let [shape_level, ground_level] = levels;
-        let row = in_blocks(y) as f32 - self.top as f32;
-        for (i, (out, d)) in out.iter_mut().zip(&difference).enumerate() {
-            let full =
-                if self.uniform { self.contrast } else { self.at(in_blocks(from + i) as f32 - self.left as f32, row) };
-            *out = (ground_level + (shape_level - ground_level) * d / full).round() as u8;
+        self.fill_reciprocals(block, (y, from), &mut line);
+        for ((out, d), reciprocal) in out.iter_mut().zip(&difference).zip(&line) {
+            // Half a level up and cut off is rounded; beyond 0 and 255 the conversion saturates.
+            *out = (ground_level + 0.5 + (shape_level - ground_level) * d * reciprocal) as u8;
         }
     }
 }

@@ -5,6 +5,7 @@
 mod shapes;
 
 use isthmus::Extractor;
+use isthmus::contour::Border;
 use isthmus::mask::{Frame, Parameters, Reason, Segmentation, segment};
 use shapes::{Camera, Neck, Piece, pose};
 
@@ -70,6 +71,24 @@ fn corners_of_half_the_light() {
         let camera = Camera { shape_level, ground_level, vignette: 0.5, noise: 3.0, ..Camera::default() };
         let (pixels, necks) = scene(camera);
         check(&grey(&pixels), &necks, &format!("{shape_level} on {ground_level}"));
+    }
+}
+
+/// Uneven light with a blurred edge moves no border as a whole: the area enclosed stays.
+#[test]
+fn corners_of_half_the_light_out_of_focus() {
+    /// Most that the border may lie outside or inside of where it lies under even light, on the mean, in pixels.
+    const BORDER: f64 = 0.15;
+    let areas = |vignette: f64| -> Vec<(f64, f64)> {
+        let (pixels, _) = scene(Camera { vignette, noise: 10.0, blur: 4.0, ..Camera::default() });
+        let found = grey(&pixels);
+        assert_eq!(found.cutouts.len(), CENTRES.len(), "vignette {vignette}: {:?}", found.rejected);
+        let border = |c| Border::from_cutout(c).unwrap().0;
+        found.cutouts.iter().map(border).map(|b| (b.area(), b.length())).collect()
+    };
+    for ((even, length), (uneven, _)) in areas(0.0).into_iter().zip(areas(0.5)) {
+        let offset = (uneven - even) / length;
+        assert!(offset.abs() < BORDER, "the border lies {offset} px outside of where it was");
     }
 }
 

@@ -141,6 +141,8 @@ pub(super) struct Ground {
     pub(super) residual: Vec<f32>,
     /// Blocks that differ by more than this belong to shapes.
     pub(super) threshold: f32,
+    /// Standard deviation of the ground's blocks.
+    pub(super) scatter: f32,
 }
 
 /// A block that differs from the ground by more than this many standard deviations of the ground's blocks is shape.
@@ -261,6 +263,7 @@ pub(super) fn fit(blocks: &Blocks, candidate: Candidate) -> Ground {
         let sigma = median(scatter) / 0.6745;
         let split = otsu(&residuals);
         let standing_out = split.mean_above;
+        ground.scatter = sigma;
         ground.threshold = (OUTLIER * sigma).max(MIN_RESIDUAL).max(MIN_RELATIVE_RESIDUAL * standing_out);
         let half = (standing_out / 2.0).max(ground.threshold);
         // Whatever is nearer to the ground than to the shapes may be ground, shadows included; the next fit is robust.
