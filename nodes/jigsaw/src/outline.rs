@@ -11,6 +11,8 @@ use nalgebra::{Isometry2, Matrix3, Matrix4, Vector2, Vector3, Vector4};
 
 /// Samples of an IDF in the shape index: enough for a tab (its finest feature is about a tenth of its path).
 pub(crate) const SHAPE_SAMPLES: usize = 64;
+/// Points of a match segment by which it is posed roughly: three to each of the eight bends of a tab.
+pub(crate) const ROUGH_SAMPLES: usize = 24;
 /// Cosine coefficients of the IDF by which the index narrows the choice; the rest of the energy is small.
 pub(crate) const KEYS: usize = 8;
 /// How far a match segment is extended beyond its critical points at most, in piece scales (the shoulders up to the
@@ -48,6 +50,10 @@ pub(crate) struct Segment {
     pub(crate) shape: [f32; SHAPE_SAMPLES],
     /// Leading cosine coefficients of `shape`: a root mean square distance between keys never exceeds that of shapes.
     pub(crate) keys: [f32; KEYS],
+    /// Points at equal parts of the path, relative to their `middle`, in the order in which a tab runs.
+    pub(crate) samples: [[f32; 2]; ROUGH_SAMPLES],
+    /// Middle of the samples, relative to the isthmus point.
+    pub(crate) middle: [f32; 2],
     /// Border points of the extended segment in running order: every border point for a mouth, thinned for a tab.
     pub(crate) run: Vec<Node>,
     /// Border length between two nodes of `run`.
@@ -178,6 +184,12 @@ impl Outline {
         }
         let mean = shape.iter().sum::<f32>() / SHAPE_SAMPLES as f32;
         shape.iter_mut().for_each(|v| *v -= mean);
+        let points: [Vector2<f64>; ROUGH_SAMPLES] = std::array::from_fn(|k| {
+            let part = k as f64 / (ROUGH_SAMPLES - 1) as f64;
+            let part = if tab { part } else { 1.0 - part };
+            self.at_arc(isthmus.arc[0] + part * isthmus.path_length) - isthmus.point
+        });
+        let middle = points.iter().sum::<Vector2<f64>>() / ROUGH_SAMPLES as f64;
         let first = (isthmus.arc[0] / self.spacing).ceil() as i64;
         let last = ((isthmus.arc[0] + isthmus.path_length) / self.spacing).floor() as i64;
         let (before, after) = (self.extension(isthmus, first, -1), self.extension(isthmus, last, 1));
@@ -204,6 +216,8 @@ impl Outline {
             arc: isthmus.arc[0],
             keys: keys(&shape),
             shape,
+            samples: points.map(|p| [(p.x - middle.x) as f32, (p.y - middle.y) as f32]),
+            middle: [middle.x as f32, middle.y as f32],
             run,
             step: thin as f64 * self.spacing,
             core: core_from.min(core_to)..core_to,

@@ -5,16 +5,18 @@
 //!
 //! Method, a variant of ICP (Chen and Medioni 1992, *Object modelling by registration of multiple range images*):
 //! 1. The samples of the two match segments, taken at equal parts of their path, give a first pose (Umeyama 1991).
-//! 2. Each sample of the tab gets its foot on the mouth's border: a walk from the foot of the last iteration.
+//! 2. Each sample of the tab gets its foot on the mouth's border: a step along the tangent from the foot of the round
+//!    before.
 //! 3. Weighted normal equations for shift, turn and clearance: residual = signed distance - clearance; the weights
 //!    (Geman-McClure) follow the median residual, so that a corner or a speck doesn't pull.
-//! 4. First the match segment alone, then extended to the shoulders up to the corners.
+//! 4. From coarse to fine: a few samples of the match segment alone for all candidates; then some nodes of the segment
+//!    extended to the shoulders up to the corners, for those that aren't hopeless; then all nodes, for the best.
 //!
-//! Complexity O(iterations · samples), some 10 µs. Fails where the first pose is off by more than about half a neck,
-//! and slides where the borders are near-circular or straight: the clearance is clamped and damped.
+//! Complexity O(rounds · samples), 1 µs to 10 µs. Fails where the first pose is off by more than about half a neck,
+//! and slides where the borders are near-circular or straight: the clearance is clamped and h.
 
-use crate::outline::{LEAST_WIDTH, Node, SHAPE_SAMPLES, Segment};
-use nalgebra::{Isometry2, Matrix3, Matrix4, Point2, Vector2, Vector3, Vector4};
+use crate::outline::{LEAST_WIDTH, Node, ROUGH_SAMPLES, Segment};
+use nalgebra::{Isometry2, Matrix4, Point2, Vector2, Vector4};
 
 /// Limit of the fitted clearance in piece scales: no cut or segmentation takes more, and a free fit may diverge.
 pub(crate) const MAX_CLEARANCE: f64 = 0.03;
@@ -24,10 +26,19 @@ pub(crate) const RESIDUAL_CAP: f64 = 0.02;
 const MAX_TURN: f64 = 0.1;
 /// Weight of "no clearance" against that of all samples: enough where nothing else tells clearance from shift.
 const CLEARANCE_DAMPING: f64 = 0.002;
-/// Steps from a rough pose to a refined one; Gauss-Newton on feet that hardly move converges in two or three.
-const REFINEMENTS: usize = 3;
-/// Samples of the match segment for a rough pose.
-const ROUGH_SAMPLES: usize = 20;
+/// Rounds from a rough pose to a coarse fit on the extended segment, and from there to a refined one: Gauss-Newton on
+/// feet that hardly move converges in two or three.
+const COARSE_ROUNDS: usize = 3;
+const REFINEMENTS: usize = 2;
+/// Rounds of a rough pose: the first without clearance, then two with.
+const ROUGH_ROUNDS: usize = 3;
+/// Most steps of the border that the foot of a point moves at once: half a turn of the tightest tab, beyond which the
+/// tangent says nothing.
+const STRIDE: f32 = 8.0;
+/// Rounds after which guessed feet have come so near to where they belong that the first step can use them.
+const SETTLING: usize = 1;
+/// Every so many nodes of a tab take part in a coarse fit: five to each bend, enough to tell most candidates apart.
+const COARSE_STRIDE: usize = 4;
 
 /// A refined contact of a tab and a mouth.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -42,9 +53,6 @@ pub(crate) struct Fit {
     /// Areas of overlap and underlap along the match segment, as posed, clearance included.
     pub(crate) pos_gap: f64,
     pub(crate) neg_gap: f64,
-    /// Information about (x, y, turn) of the tab's piece about the mouth's isthmus point, clearance eliminated, for
-    /// residuals of variance one.
-    pub(crate) information: Matrix3<f64>,
 }
 
 /// A pose during refinement: tab's local frame to mouth's local frame.
@@ -57,211 +65,279 @@ struct Pose {
 }
 
 impl Pose {
-    fn apply(&self, n: &Node) -> Vector2<f64> {
-        let (x, y) = (f64::from(n.x), f64::from(n.y));
-        Vector2::new(self.cos * x - self.sin * y + self.x, self.sin * x + self.cos * y + self.y)
+    /// Of a pose of the tab's piece in the image of the mouth's.
+    fn between(tab: &Segment, mouth: &Segment, negative_from_positive: &Isometry2<f64>) -> Self {
+        let shift = negative_from_positive * tab.origin - mouth.origin;
+        let rotation = negative_from_positive.rotation;
+        Self { cos: rotation.re, sin: rotation.im, x: shift.x, y: shift.y }
     }
 
-    fn turned(&self, angle: f64, about: Vector2<f64>, shift: Vector2<f64>) -> Self {
+    fn turned(&self, angle: f64, shift: Vector2<f64>) -> Self {
         let (sin, cos) = angle.sin_cos();
-        let (x, y) = (self.x - about.x, self.y - about.y);
         let (c, s) = (cos * self.cos - sin * self.sin, sin * self.cos + cos * self.sin);
         let norm = c.hypot(s);
         Self {
             cos: c / norm,
             sin: s / norm,
-            x: cos * x - sin * y + about.x + shift.x,
-            y: sin * x + cos * y + about.y + shift.y,
+            x: cos * self.x - sin * self.y + shift.x,
+            y: sin * self.x + cos * self.y + shift.y,
         }
     }
 }
 
-/// Point of a run at a part of its core, in `0..=1`.
-fn core_point(segment: &Segment, part: f64) -> Vector2<f64> {
-    let s = segment.core.start as f64 + part * (segment.core.len().max(1) - 1) as f64;
-    let i = (s as usize).min(segment.run.len() - 1);
-    let j = (i + 1).min(segment.run.len() - 1);
-    let t = s - i as f64;
-    let (a, b) = (&segment.run[i], &segment.run[j]);
-    let lerp = |p: f32, q: f32| f64::from(p) * (1.0 - t) + f64::from(q) * t;
-    Vector2::new(lerp(a.x, b.x), lerp(a.y, b.y))
-}
-
-/// Best rigid pose of paired points (Umeyama 1991 without scale).
+/// Best rigid pose of the samples of the two match segments, pair by pair (Umeyama 1991 without scale).
 fn first_pose(tab: &Segment, mouth: &Segment) -> Pose {
-    const PAIRS: usize = SHAPE_SAMPLES / 2;
-    let (mut ma, mut mb) = (Vector2::zeros(), Vector2::zeros());
-    let (mut dot, mut cross) = (0.0, 0.0);
-    let pair = |k: usize| {
-        let part = k as f64 / (PAIRS - 1) as f64;
-        (core_point(tab, part), core_point(mouth, 1.0 - part))
-    };
-    for k in 0..PAIRS {
-        let (a, b) = pair(k);
-        ma += a;
-        mb += b;
-        dot += a.dot(&b);
-        cross += a.x * b.y - a.y * b.x;
+    let (mut dot, mut cross) = (0f32, 0f32);
+    for (a, b) in tab.samples.iter().zip(&mouth.samples) {
+        dot += a[0] * b[0] + a[1] * b[1];
+        cross += a[0] * b[1] - a[1] * b[0];
     }
-    let n = PAIRS as f64;
-    ma /= n;
-    mb /= n;
-    dot -= n * ma.dot(&mb);
-    cross -= n * (ma.x * mb.y - ma.y * mb.x);
+    let (dot, cross) = (f64::from(dot), f64::from(cross));
     let norm = dot.hypot(cross).max(f64::EPSILON);
     let (cos, sin) = (dot / norm, cross / norm);
-    Pose { cos, sin, x: mb.x - cos * ma.x + sin * ma.y, y: mb.y - sin * ma.x - cos * ma.y }
+    let [ax, ay] = tab.middle.map(f64::from);
+    let [bx, by] = mouth.middle.map(f64::from);
+    Pose { cos, sin, x: bx - cos * ax + sin * ay, y: by - sin * ax - cos * ay }
 }
 
-/// Foot of a point on a run, walking from `at`: signed distance (positive outside), unit normal; `None` beyond an end.
-fn foot(run: &[Node], at: &mut usize, p: Vector2<f64>) -> Option<(f64, Vector2<f64>)> {
-    let square = |i: usize| {
-        let (dx, dy) = (p.x - f64::from(run[i].x), p.y - f64::from(run[i].y));
-        dx * dx + dy * dy
-    };
-    let mut i = (*at).min(run.len() - 1);
-    let mut best = square(i);
-    // Downhill in one direction, looking two points ahead so that a speck of noise doesn't stop the walk.
-    let from = i;
-    for direction in [1isize, -1] {
-        let mut k = from;
-        let mut misses = 0;
-        while misses < 2 {
-            k = k.wrapping_add_signed(direction);
-            if k >= run.len() {
-                break;
-            }
-            let d = square(k);
-            if d < best {
-                (best, i, misses) = (d, k, 0);
-            } else {
-                misses += 1;
-            }
-        }
-        if i != from {
-            break;
-        }
-    }
-    *at = i;
-    if i == 0 || i + 1 == run.len() {
-        return None;
-    }
-    let q = Vector2::new(f64::from(run[i].x), f64::from(run[i].y));
-    let next = &run[i + 1];
-    let prev = &run[i - 1];
-    let forward = Vector2::new(f64::from(next.x), f64::from(next.y)) - q;
-    let along = (p - q).dot(&forward);
-    let (other, edge, part) = if along >= 0.0 {
-        (next, forward, along / forward.norm_squared().max(f64::EPSILON))
-    } else {
-        let back = Vector2::new(f64::from(prev.x), f64::from(prev.y)) - q;
-        (prev, back, ((p - q).dot(&back) / back.norm_squared().max(f64::EPSILON)).max(0.0))
-    };
-    let part = part.min(1.0);
-    let base = q + edge * part;
-    let normal = Vector2::new(
-        f64::from(run[i].nx) * (1.0 - part) + f64::from(other.nx) * part,
-        f64::from(run[i].ny) * (1.0 - part) + f64::from(other.ny) * part,
-    );
-    let normal = normal / normal.norm().max(f64::EPSILON);
-    Some(((p - base).dot(&normal), normal))
+/// Points worked on side by side, so that the arithmetic fills vector registers.
+const LANES: usize = 4;
+
+/// Some points of a tab with their feet on a mouth's border, in the mouth's frame but for `x` and `y`.
+#[derive(Debug, Clone, Copy, Default)]
+struct Quad {
+    /// The points in the tab's frame.
+    x: [f32; LANES],
+    y: [f32; LANES],
+    /// Places of their feet on the mouth's run, in steps.
+    at: [f32; LANES],
+    /// The points in the mouth's frame.
+    px: [f32; LANES],
+    py: [f32; LANES],
+    /// Signed distance to the border, positive outside.
+    distance: [f32; LANES],
+    /// Outward normal at the foot.
+    nx: [f32; LANES],
+    ny: [f32; LANES],
+    /// 1, or 0 where there is no point.
+    present: [f32; LANES],
+    /// 1, or 0 where there is no point or where it has no foot because it lies beyond an end of the run.
+    mask: [f32; LANES],
 }
 
-/// Feet of the samples of a range of the tab's run.
-struct Feet {
-    at: Vec<usize>,
-    rows: Vec<(f64, Vector2<f64>, Vector2<f64>)>,
-    /// The rows on the match segment proper.
+impl Quad {
+    /// Moves the points and finds their feet near where they were: along the tangent, once. Rounds of refinement that
+    /// follow one another take a foot to where it belongs (Newton's method, without a branch for each point).
+    fn find(&mut self, run: &[Node], step: f32, (cos, sin, x, y): (f32, f32, f32, f32)) {
+        let most = run.len() - 2;
+        let last = (most + 1) as f32;
+        for l in 0..LANES {
+            self.px[l] = cos * self.x[l] - sin * self.y[l] + x;
+            self.py[l] = sin * self.x[l] + cos * self.y[l] + y;
+        }
+        let place = self.at.map(|at| (at as usize).min(most));
+        let node = place.map(|i| run[i]);
+        let mut moved = [0.0; LANES];
+        for l in 0..LANES {
+            // Outward normals stand to the right of the running direction in an image, whose y points down.
+            let along = (self.py[l] - node[l].y) * node[l].nx - (self.px[l] - node[l].x) * node[l].ny;
+            moved[l] = place[l] as f32 + (along * step).clamp(-STRIDE, STRIDE);
+            self.at[l] = moved[l].clamp(0.0, last);
+        }
+        let place = self.at.map(|at| (at as usize).min(most));
+        let (here, next) = (place.map(|i| run[i]), place.map(|i| run[i + 1]));
+        for l in 0..LANES {
+            let part = self.at[l] - place[l] as f32;
+            let lerp = |p: f32, q: f32| p + (q - p) * part;
+            let (a, b) = (&here[l], &next[l]);
+            self.nx[l] = lerp(a.nx, b.nx);
+            self.ny[l] = lerp(a.ny, b.ny);
+            self.distance[l] = (self.px[l] - lerp(a.x, b.x)) * self.nx[l] + (self.py[l] - lerp(a.y, b.y)) * self.ny[l];
+            self.mask[l] = if moved[l] == self.at[l] { self.present[l] } else { 0.0 };
+        }
+    }
+}
+
+/// Points of a tab with their feet on a mouth's border; kept between candidates, so that nothing is allocated for each
+/// of them.
+#[derive(Debug, Default)]
+pub(crate) struct Feet {
+    quads: Vec<Quad>,
+    /// Which points lie on the match segment proper.
     core: std::ops::Range<usize>,
-    off: Vec<f64>,
+    off: Vec<f32>,
 }
 
 impl Feet {
-    fn new(tab: &Segment, mouth: &Segment) -> Self {
-        // The borders run opposite ways: equal parts of the two cores lie on one another.
-        let ratio = tab.step / mouth.step * mouth.path / tab.path;
-        let at = (0..tab.run.len())
-            .map(|k| {
-                let s = mouth.core.end as f64 - 1.0 - (k as f64 - tab.core.start as f64) * ratio;
-                s.clamp(0.0, (mouth.run.len() - 1) as f64) as usize
-            })
-            .collect();
-        Self { at, rows: Vec::with_capacity(tab.run.len()), core: 0..0, off: Vec::with_capacity(tab.run.len()) }
-    }
-
-    fn find(&mut self, tab: &Segment, mouth: &Segment, range: impl Iterator<Item = usize>, pose: &Pose) {
-        self.rows.clear();
-        self.core = 0..0;
-        for k in range {
-            let p = pose.apply(&tab.run[k]);
-            if let Some((distance, normal)) = foot(&mouth.run, &mut self.at[k], p) {
-                self.rows.push((distance, normal, p));
+    /// Takes points and the places at which to look first for their feet.
+    fn start(&mut self, points: impl Iterator<Item = (f32, f32, f64)>, mouth: &Segment) {
+        let last = mouth.run.len().saturating_sub(1) as f64;
+        self.quads.clear();
+        for (k, (x, y, place)) in points.enumerate() {
+            if k % LANES == 0 {
+                self.quads.push(Quad::default());
             }
-            if k < tab.core.start {
-                self.core.start = self.rows.len();
-            }
-            if k < tab.core.end {
-                self.core.end = self.rows.len();
+            if let Some(quad) = self.quads.last_mut() {
+                let l = k % LANES;
+                (quad.x[l], quad.y[l], quad.at[l]) = (x, y, place.clamp(0.0, last) as f32);
+                quad.present[l] = 1.0;
             }
         }
     }
 
-    /// Mean capped residual of some rows.
-    fn residual(&self, rows: std::ops::Range<usize>, clearance: f64, cap: f64) -> f64 {
-        let count = rows.len().max(1) as f64;
-        self.rows[rows].iter().map(|r| (r.0 - clearance).abs().min(cap)).sum::<f64>() / count
+    /// Starts with the samples of the match segment: they lie at equal parts of both.
+    fn start_with_samples(&mut self, tab: &Segment, mouth: &Segment) {
+        let core = (mouth.core.len() - 1) as f64 / (ROUGH_SAMPLES - 1) as f64;
+        let place = |k: usize| mouth.core.end as f64 - 1.0 - k as f64 * core;
+        let [x, y] = tab.middle;
+        self.start(tab.samples.iter().enumerate().map(|(k, s)| (s[0] + x, s[1] + y, place(k))), mouth);
+        self.core = 0..ROUGH_SAMPLES;
     }
 
+    /// Starts with every `stride`-th node of the tab. The borders run opposite ways: equal parts of the two cores lie on
+    /// one another.
+    fn start_with_nodes(&mut self, tab: &Segment, mouth: &Segment, stride: usize) {
+        let ratio = tab.step / mouth.step * mouth.path / tab.path;
+        let place = |k: usize| mouth.core.end as f64 - 1.0 - (k as f64 - tab.core.start as f64) * ratio;
+        let nodes = tab.run.iter().enumerate().step_by(stride);
+        self.start(nodes.map(|(k, n)| (n.x, n.y, place(k))), mouth);
+        self.core = tab.core.start.div_ceil(stride)..tab.core.end.div_ceil(stride);
+    }
+
+    fn find(&mut self, mouth: &Segment, pose: &Pose) {
+        let pose = (pose.cos as f32, pose.sin as f32, pose.x as f32, pose.y as f32);
+        let step = (1.0 / mouth.step) as f32;
+        for quad in &mut self.quads {
+            quad.find(&mouth.run, step, pose);
+        }
+    }
+
+    /// Brings feet that were only guessed to where they belong.
+    fn settle(&mut self, mouth: &Segment, pose: &Pose) {
+        for _ in 0..SETTLING {
+            self.find(mouth, pose);
+        }
+    }
+
+    /// Distances of the points that have feet, of some of the points.
+    fn distances(&self, points: std::ops::Range<usize>) -> impl Iterator<Item = f32> {
+        let quads = self.quads.iter().enumerate().take(points.end.div_ceil(LANES)).skip(points.start / LANES);
+        quads.flat_map(move |(k, quad)| {
+            let points = points.clone();
+            (0..LANES)
+                .filter(move |l| quad.mask[*l] > 0.0 && points.contains(&(k * LANES + l)))
+                .map(move |l| quad.distance[l])
+        })
+    }
+
+    fn points(&self) -> std::ops::Range<usize> {
+        0..self.quads.len() * LANES
+    }
+
+    /// How many points have a foot.
+    fn rows(&self) -> usize {
+        self.quads.iter().map(|q| q.mask.iter().sum::<f32>() as usize).sum()
+    }
+
+    /// Mean capped residual of some of the points.
+    fn residual(&self, points: std::ops::Range<usize>, clearance: f64, cap: f64) -> f64 {
+        let (clearance, cap) = (clearance as f32, cap as f32);
+        let (mut sum, mut count) = (0.0, 0);
+        for d in self.distances(points) {
+            sum += f64::from((d - clearance).abs().min(cap));
+            count += 1;
+        }
+        sum / f64::from(count.max(1))
+    }
+
+    /// Median residual.
     fn spread(&mut self, clearance: f64) -> f64 {
+        let clearance = clearance as f32;
         self.off.clear();
-        self.off.extend(self.rows.iter().map(|r| (r.0 - clearance).abs()));
+        for quad in &self.quads {
+            for l in 0..LANES {
+                if quad.mask[l] > 0.0 {
+                    self.off.push((quad.distance[l] - clearance).abs());
+                }
+            }
+        }
         if self.off.is_empty() {
             return 0.0;
         }
         let middle = self.off.len() / 2;
-        *self.off.select_nth_unstable_by(middle, f64::total_cmp).1
+        f64::from(*self.off.select_nth_unstable_by(middle, f32::total_cmp).1)
+    }
+
+    /// Weighted normal equations over (x, y, turn, clearance) about the local origin: matrix, right side, sum of
+    /// weights.
+    #[allow(clippy::needless_range_loop, reason = "a lane of many arrays side by side")]
+    fn normal_equations(&self, clearance: f64, width: f64) -> (Matrix4<f64>, Vector4<f64>, f64) {
+        /// Different products that are summed: ten of the symmetric matrix, the last of which is the sum of weights,
+        /// and four of the right side.
+        const SUMS: usize = 14;
+        let (clearance, inverse) = (clearance as f32, 1.0 / width.max(f64::EPSILON) as f32);
+        let mut sums = [[0f32; LANES]; SUMS];
+        for q in &self.quads {
+            for l in 0..LANES {
+                let (nx, ny) = (q.nx[l], q.ny[l]);
+                let r = q.distance[l] - clearance;
+                let z = r * inverse;
+                let w = 1.0 / (1.0 + z * z);
+                let w = w * w * q.mask[l];
+                let turn = q.px[l] * ny - q.py[l] * nx;
+                let (wx, wy, wt, wr) = (w * nx, w * ny, w * turn, w * r);
+                sums[0][l] += wx * nx;
+                sums[1][l] += wx * ny;
+                sums[2][l] += wx * turn;
+                sums[3][l] += wx;
+                sums[4][l] += wy * ny;
+                sums[5][l] += wy * turn;
+                sums[6][l] += wy;
+                sums[7][l] += wt * turn;
+                sums[8][l] += wt;
+                sums[9][l] += w;
+                sums[10][l] += wr * nx;
+                sums[11][l] += wr * ny;
+                sums[12][l] += wr * turn;
+                sums[13][l] += wr;
+            }
+        }
+        let s = sums.map(|lanes| f64::from(lanes.iter().sum::<f32>()));
+        let h = Matrix4::new(
+            s[0], s[1], s[2], -s[3], //
+            s[1], s[4], s[5], -s[6], //
+            s[2], s[5], s[7], -s[8], //
+            -s[3], -s[6], -s[8], s[9],
+        );
+        (h, Vector4::new(s[10], s[11], s[12], -s[13]), s[9])
     }
 }
 
-/// One step of weighted least squares; returns the normal matrix over (x, y, turn, clearance) about the local origin.
-fn step(feet: &mut Feet, pose: &mut Pose, clearance: &mut f64, free: bool, limit: f64) -> Matrix4<f64> {
+/// One step of weighted least squares.
+fn step(feet: &mut Feet, pose: &mut Pose, clearance: &mut f64, free: bool, limit: f64) {
     let width = (3.0 * feet.spread(*clearance)).max(LEAST_WIDTH / MAX_CLEARANCE * limit);
-    let mut h = Matrix4::zeros();
-    let mut g = Vector4::zeros();
-    let mut total = 0.0;
-    for (distance, normal, p) in &feet.rows {
-        let r = distance - *clearance;
-        let z = r / width;
-        let w = 1.0 / (1.0 + z * z);
-        let w = w * w;
-        let j = Vector4::new(normal.x, normal.y, p.x * normal.y - p.y * normal.x, -1.0);
-        h += j * j.transpose() * w;
-        g += j * (w * r);
-        total += w;
-    }
+    let (mut h, mut g, total) = feet.normal_equations(*clearance, width);
     if total < 4.0 {
-        return h;
+        return;
     }
-    let mut damped = h;
     // A prior of a few samples' weight keeps the clearance from sliding where the normals don't tell it from a shift.
     if free {
-        damped[(3, 3)] += CLEARANCE_DAMPING * total;
+        h[(3, 3)] += CLEARANCE_DAMPING * total;
         g[3] += CLEARANCE_DAMPING * total * *clearance;
     } else {
-        damped[(3, 3)] += 1e9 * total;
+        h[(3, 3)] += 1e9 * total;
     }
     for k in 0..2 {
-        damped[(k, k)] += 1e-9 * total;
+        h[(k, k)] += 1e-9 * total;
     }
-    damped[(2, 2)] += 1e-9 * total * limit * limit;
-    if let Some(solution) = damped.cholesky().map(|c| c.solve(&-g)) {
+    h[(2, 2)] += 1e-9 * total * limit * limit;
+    if let Some(solution) = h.cholesky().map(|c| c.solve(&-g)) {
         let turn = solution[2].clamp(-MAX_TURN, MAX_TURN);
-        *pose = pose.turned(turn, Vector2::zeros(), Vector2::new(solution[0], solution[1]));
+        *pose = pose.turned(turn, Vector2::new(solution[0], solution[1]));
         if free {
             *clearance = (*clearance + solution[3]).clamp(-limit, limit);
         }
     }
-    h
 }
 
 /// A rough pose, from a few samples of the match segment alone.
@@ -275,59 +351,90 @@ pub(crate) struct Rough {
 
 /// Poses a tab in a mouth roughly: what is far off after this can't be a mating. `scale` is the piece scale, `free`
 /// whether the clearance is fitted.
-pub(crate) fn rough(tab: &Segment, mouth: &Segment, scale: f64, free: bool) -> Option<Rough> {
+pub(crate) fn rough(tab: &Segment, mouth: &Segment, scale: f64, free: bool, feet: &mut Feet) -> Option<Rough> {
     if tab.core.len() < 4 || mouth.core.len() < 4 {
         return None;
     }
     let mut pose = first_pose(tab, mouth);
     let mut clearance = 0.0;
     let limit = MAX_CLEARANCE * scale;
-    let stride = (tab.core.len() / ROUGH_SAMPLES).max(1);
-    let mut feet = Feet::new(tab, mouth);
-    for round in 0..3 {
-        feet.find(tab, mouth, tab.core.clone().step_by(stride), &pose);
-        step(&mut feet, &mut pose, &mut clearance, free && round > 0, limit);
+    feet.start_with_samples(tab, mouth);
+    for round in 0..ROUGH_ROUNDS {
+        feet.find(mouth, &pose);
+        step(feet, &mut pose, &mut clearance, free && round > 0, limit);
     }
-    feet.find(tab, mouth, tab.core.clone().step_by(stride), &pose);
-    if feet.rows.len() * stride < tab.core.len() / 2 {
+    feet.find(mouth, &pose);
+    if feet.rows() < ROUGH_SAMPLES / 2 {
         return None;
     }
-    Some(Rough { pose, clearance, residual: feet.residual(0..feet.rows.len(), clearance, RESIDUAL_CAP * scale) })
+    Some(Rough { pose, clearance, residual: feet.residual(feet.points(), clearance, RESIDUAL_CAP * scale) })
 }
 
-/// Refines a rough pose on the extended match segment.
-pub(crate) fn refine(tab: &Segment, mouth: &Segment, from: &Rough, scale: f64, free: bool) -> Option<Fit> {
-    let Rough { mut pose, mut clearance, .. } = *from;
+/// Refines a rough pose on a part of the nodes of the extended match segment: enough to tell which candidates are worth
+/// all of them.
+pub(crate) fn coarse(
+    tab: &Segment,
+    mouth: &Segment,
+    from: &Rough,
+    scale: f64,
+    free: bool,
+    feet: &mut Feet,
+) -> Option<Fit> {
+    fit(tab, mouth, (from.pose, from.clearance), scale, free, (COARSE_ROUNDS, COARSE_STRIDE), feet)
+}
+
+/// Refines a coarse fit on all nodes of the extended match segment.
+pub(crate) fn refine(
+    tab: &Segment,
+    mouth: &Segment,
+    from: &Fit,
+    scale: f64,
+    free: bool,
+    feet: &mut Feet,
+) -> Option<Fit> {
+    let pose = Pose::between(tab, mouth, &from.negative_from_positive);
+    fit(tab, mouth, (pose, from.clearance), scale, free, (REFINEMENTS, 1), feet)
+}
+
+fn fit(
+    tab: &Segment,
+    mouth: &Segment,
+    (mut pose, mut clearance): (Pose, f64),
+    scale: f64,
+    free: bool,
+    (rounds, stride): (usize, usize),
+    feet: &mut Feet,
+) -> Option<Fit> {
     let limit = MAX_CLEARANCE * scale;
-    let cap = RESIDUAL_CAP * scale;
-    let mut feet = Feet::new(tab, mouth);
-    let mut h = Matrix4::zeros();
-    for _ in 0..REFINEMENTS {
-        feet.find(tab, mouth, 0..tab.run.len(), &pose);
-        h = step(&mut feet, &mut pose, &mut clearance, free, limit);
+    feet.start_with_nodes(tab, mouth, stride);
+    feet.settle(mouth, &pose);
+    for _ in 0..rounds {
+        feet.find(mouth, &pose);
+        step(feet, &mut pose, &mut clearance, free, limit);
     }
-    feet.find(tab, mouth, 0..tab.run.len(), &pose);
-    if feet.rows.len() < tab.core.len() / 2 {
+    feet.find(mouth, &pose);
+    if feet.rows() * stride < tab.core.len() / 2 {
         return None;
     }
-    let residual = feet.residual(0..feet.rows.len(), clearance, cap);
-    Some(fit_of(tab, mouth, &feet, &pose, clearance, residual, cap, reduced(&h, free)))
+    let cap = RESIDUAL_CAP * scale;
+    let residual = feet.residual(feet.points(), clearance, cap);
+    Some(figures(tab, mouth, feet, &pose, clearance, (residual, cap), tab.step * stride as f64))
 }
 
-#[allow(clippy::too_many_arguments, reason = "the figures of one finished refinement")]
-fn fit_of(
+/// The figures of a finished refinement.
+fn figures(
     tab: &Segment,
     mouth: &Segment,
     feet: &Feet,
     pose: &Pose,
     clearance: f64,
-    residual: f64,
-    cap: f64,
-    information: Matrix3<f64>,
+    (residual, cap): (f64, f64),
+    step: f64,
 ) -> Fit {
     let (mut pos_gap, mut neg_gap) = (0.0, 0.0);
-    for (distance, ..) in &feet.rows[feet.core.clone()] {
-        if *distance < 0.0 { pos_gap -= distance * tab.step } else { neg_gap += distance * tab.step }
+    for distance in feet.distances(feet.core.clone()) {
+        let area = f64::from(distance) * step;
+        if area < 0.0 { pos_gap -= area } else { neg_gap += area }
     }
     let rotation = nalgebra::UnitComplex::from_cos_sin_unchecked(pose.cos, pose.sin);
     let translation = mouth.origin.coords + Vector2::new(pose.x, pose.y) - rotation * tab.origin.coords;
@@ -338,28 +445,21 @@ fn fit_of(
         ave_gap: feet.residual(feet.core.clone(), clearance, cap),
         pos_gap,
         neg_gap,
-        information,
     }
 }
 
 /// The figures of a given pose, unrefined, with no clearance: for the rules of the paper.
 pub(crate) fn as_posed(tab: &Segment, mouth: &Segment, pose: &Isometry2<f64>, scale: f64) -> Option<Fit> {
-    let shift = pose * tab.origin - mouth.origin;
-    let pose = Pose { cos: pose.rotation.re, sin: pose.rotation.im, x: shift.x, y: shift.y };
-    let mut feet = Feet::new(tab, mouth);
-    feet.find(tab, mouth, tab.core.clone(), &pose);
-    if feet.rows.len() < tab.core.len() / 2 {
+    let pose = Pose::between(tab, mouth, pose);
+    let mut feet = Feet::default();
+    feet.start_with_nodes(tab, mouth, 1);
+    feet.settle(mouth, &pose);
+    feet.find(mouth, &pose);
+    if feet.distances(feet.core.clone()).count() < (tab.core.len() / 2).max(1) {
         return None;
     }
     let residual = feet.residual(feet.core.clone(), 0.0, f64::INFINITY);
-    Some(fit_of(tab, mouth, &feet, &pose, 0.0, residual, RESIDUAL_CAP * scale, Matrix3::identity()))
-}
-
-/// Takes the clearance out of the normal matrix (Schur complement).
-fn reduced(h: &Matrix4<f64>, free: bool) -> Matrix3<f64> {
-    let block = h.fixed_view::<3, 3>(0, 0).into_owned();
-    let column: Vector3<f64> = h.fixed_view::<3, 1>(0, 3).into_owned();
-    if free && h[(3, 3)] > f64::EPSILON { block - column * column.transpose() / h[(3, 3)] } else { block }
+    Some(figures(tab, mouth, &feet, &pose, 0.0, (residual, RESIDUAL_CAP * scale), tab.step))
 }
 
 /// Best rigid pose that takes points `a` to points `b` (Umeyama 1991 without scale).

@@ -76,6 +76,8 @@ pub struct Candidate {
     pub neg_gap: f64,
     /// Mean gap along the match segment, clearance taken off, in pixels.
     pub ave_gap: f64,
+    /// Mean gap along the match segment and its shoulders, clearance taken off, in pixels: what ranks candidates.
+    pub residual: f64,
     /// Fitted clearance, in pixels.
     pub clearance: f64,
     /// How many loops of pieces close over it.
@@ -120,8 +122,9 @@ struct Match {
     hit: Hit,
     /// `None` where not even a rough pose was found.
     rough: Option<placement::Rough>,
-    /// Refined pose, of the roughly best only.
-    fit: Option<placement::Fit>,
+    /// Coarse fit, of the roughly best only, and refined fit, of the best of these.
+    coarse: Option<placement::Fit>,
+    fine: Option<placement::Fit>,
 }
 
 /// The solver. Pieces are taken in one by one; [`Solver::solve`] matches what is new and assembles all.
@@ -314,7 +317,7 @@ impl Solver {
         let new = Index::new(entries(&fresh));
         let keep = self.params.candidates;
         let free = self.params.fit_clearance;
-        self.matches.par_iter_mut().enumerate().for_each(|(piece, lists)| {
+        self.matches.par_iter_mut().enumerate().for_each_init(placement::Feet::default, |feet, (piece, lists)| {
             let outline = outlines[piece];
             let index = if lists.is_none() { &all } else { &new };
             let lists = lists.get_or_insert_with(|| vec![Vec::new(); outline.mouths.len()]);
@@ -326,17 +329,11 @@ impl Solver {
                         continue;
                     }
                     let tab = &outlines[hit.piece as usize].tabs[hit.tab as usize];
-                    let rough = placement::rough(tab, mouth, outline.scale, free);
-                    list.insert(place, Match { hit, rough, fit: None });
+                    let rough = placement::rough(tab, mouth, outline.scale, free, feet);
+                    list.insert(place, Match { hit, rough, coarse: None, fine: None });
                     list.truncate(keep);
                 }
-                for place in best_places(list, outline.scale) {
-                    let m = &mut list[place];
-                    if let (Some(rough), None) = (&m.rough, &m.fit) {
-                        let tab = &outlines[m.hit.piece as usize].tabs[m.hit.tab as usize];
-                        m.fit = placement::refine(tab, mouth, rough, outline.scale, free);
-                    }
-                }
+                refine(list, mouth, &outlines, (outline.scale, free), feet);
             }
         });
     }
@@ -348,9 +345,8 @@ impl Solver {
         for &piece in order {
             let scale = self.outlines[piece].as_ref().map_or(1.0, |o| o.scale);
             for (mouth, list) in self.matches[piece].iter().flatten().enumerate() {
-                for place in best_places(list, scale) {
+                for (place, fit) in best_fits(list, scale) {
                     let m = &list[place];
-                    let Some(fit) = m.fit else { continue };
                     let (a, b) = (rank[m.hit.piece as usize], rank[piece]);
                     joints.push(Joint { a, tab: m.hit.tab as usize, b, mouth, fit });
                     distances.push(f64::from(m.hit.distance));
@@ -397,6 +393,7 @@ impl Solver {
                 pos_gap: j.fit.pos_gap,
                 neg_gap: j.fit.neg_gap,
                 ave_gap: j.fit.ave_gap,
+                residual: j.fit.residual,
                 clearance: j.fit.clearance,
                 support: outcome.support[k],
                 negative_from_positive: j.fit.negative_from_positive,
@@ -493,19 +490,66 @@ fn count(outlines: &[&Outline], joints: &[Joint]) -> TableCounts {
 
 /// Candidates of a mouth that are refined in any case.
 const REFINED: usize = 4;
-/// More are refined if their rough residual is at most this many times the best one's, and this much more, in piece
-/// scales: what a rough pose may be off.
+/// More are fitted coarsely if their rough residual is at most this many times the best one's, and this much more, in
+/// piece scales: what a rough pose may be off.
 const ROUGHLY: (f64, f64) = (2.0, 0.0015);
+/// The same for a refined fit, by the residuals of the coarse ones.
+const COARSELY: (f64, f64) = (1.5, 0.001);
 
-/// Places in a mouth's list of the candidates to refine, best rough pose first.
-fn best_places(list: &[Match], scale: f64) -> Vec<usize> {
-    let residual = |k: &usize| list[*k].rough.map_or(f64::INFINITY, |r| r.residual);
-    let mut places: Vec<usize> = (0..list.len()).filter(|k| list[*k].rough.is_some()).collect();
-    places.sort_by(|p, q| residual(p).total_cmp(&residual(q)).then(list[*p].hit.order(&list[*q].hit)));
-    let limit = places.first().map_or(0.0, |k| ROUGHLY.0 * residual(k) + ROUGHLY.1 * scale);
-    let near = places.partition_point(|k| residual(k) <= limit);
-    places.truncate(near.max(REFINED));
-    places
+/// Those of some places in a mouth's list whose residual is within `near` of the least, but at least [`REFINED`]; best
+/// first.
+fn best(list: &[Match], residuals: impl Iterator<Item = (f64, usize)>, near: (f64, f64), scale: f64) -> Vec<usize> {
+    let mut places: Vec<(f64, usize)> = residuals.collect();
+    places.sort_by(|p, q| p.0.total_cmp(&q.0).then(list[p.1].hit.order(&list[q.1].hit)));
+    let limit = places.first().map_or(0.0, |p| near.0 * p.0 + near.1 * scale);
+    let within = places.partition_point(|p| p.0 <= limit);
+    places.truncate(within.max(REFINED));
+    places.into_iter().map(|p| p.1).collect()
+}
+
+/// Places in a mouth's list of the candidates to fit coarsely.
+fn roughly_best(list: &[Match], scale: f64) -> Vec<usize> {
+    let residuals = list.iter().enumerate().filter_map(|(k, m)| Some((m.rough?.residual, k)));
+    best(list, residuals, ROUGHLY, scale)
+}
+
+/// Those of them to refine.
+fn coarsely_best(list: &[Match], places: &[usize], scale: f64) -> Vec<usize> {
+    let residuals = places.iter().filter_map(|k| Some((list[*k].coarse?.residual, *k)));
+    best(list, residuals, COARSELY, scale)
+}
+
+/// Fits what has to be fitted in a mouth's list and isn't yet.
+fn refine(
+    list: &mut [Match],
+    mouth: &Segment,
+    outlines: &[&Outline],
+    (scale, free): (f64, bool),
+    feet: &mut placement::Feet,
+) {
+    let tab = |m: &Match| &outlines[m.hit.piece as usize].tabs[m.hit.tab as usize];
+    let places = roughly_best(list, scale);
+    for &place in &places {
+        let m = &mut list[place];
+        if let (Some(rough), None) = (&m.rough, &m.coarse) {
+            m.coarse = placement::coarse(tab(m), mouth, rough, scale, free, feet);
+        }
+    }
+    for place in coarsely_best(list, &places, scale) {
+        let m = &mut list[place];
+        if let (Some(coarse), None) = (&m.coarse, &m.fine) {
+            m.fine = placement::refine(tab(m), mouth, coarse, scale, free, feet);
+        }
+    }
+}
+
+/// The fits of a mouth's list that stand: refined where the coarse one is good enough. Which these are depends on the
+/// list alone, not on what was fitted while it was another.
+fn best_fits(list: &[Match], scale: f64) -> Vec<(usize, placement::Fit)> {
+    let places = roughly_best(list, scale);
+    let fine = coarsely_best(list, &places, scale);
+    let fit = |k: usize| if fine.contains(&k) { list[k].fine } else { list[k].coarse };
+    places.into_iter().filter_map(|k| Some((k, fit(k)?))).collect()
 }
 
 /// A mean residual above this part of the cap means that the borders don't follow each other at all.
