@@ -8,8 +8,8 @@ use futures::channel::{mpsc, oneshot};
 use futures::{StreamExt, stream};
 use image::ExtendedColorType;
 use jigsaw::generate::{Options, Puzzle};
-use jigsaw_msgs::action::{AssembleFeedback, AssembleResult};
-use jigsaw_msgs::builtin_interfaces::msg::Time;
+use jigsaw_msgs::action::{AssembleFeedback, AssembleGoal, AssembleResult};
+use jigsaw_msgs::builtin_interfaces::msg::{Duration, Time};
 use jigsaw_msgs::geometry_msgs::msg::Pose;
 use jigsaw_msgs::msg::{Assembly, PieceFeatures, PieceImage};
 use jigsaw_msgs::sensor_msgs::msg::{CompressedImage, Image};
@@ -20,6 +20,7 @@ use jigsaw_msgs::visualization_msgs::msg::{Marker, MarkerArray};
 use jigsaw_nodes::capture::source::Frame;
 use jigsaw_nodes::ros::actions::{Goal, GoalEnd};
 use jigsaw_nodes::ros::health::Health;
+use jigsaw_nodes::ros::lifecycle::Activity;
 use jigsaw_nodes::ros::params::{Parameters, Spec};
 use jigsaw_nodes::ros::session::Call;
 use jigsaw_nodes::ros::transforms::PixelPlane;
@@ -68,18 +69,26 @@ fn raw_frames(puzzle: &Puzzle) -> Vec<Frame> {
 
 fn run_capture(frames: Vec<Frame>, calls: Vec<Call<Trigger>>, health: &Arc<Health>) -> Vec<PieceImage> {
     let (sender, receiver) = mpsc::unbounded();
-    let settings =
-        capture::Settings { parameters: parameters(capture::params::PARAMETERS), health: Arc::clone(health) };
-    smol::block_on(capture::run(stream::iter(frames), stream::iter(calls), sender, settings));
+    let settings = capture::Settings {
+        parameters: parameters(capture::params::PARAMETERS),
+        health: Arc::clone(health),
+        activity: Activity::always(),
+    };
+    let requests = capture::Requests { calls: stream::iter(calls), forgets: stream::empty() };
+    smol::block_on(capture::run(stream::iter(frames), requests, sender, settings));
     smol::block_on(receiver.collect())
 }
 
 fn run_feature(pieces: Vec<PieceImage>, health: &Arc<Health>) -> Vec<PieceFeatures> {
     let (sender, receiver) = mpsc::unbounded();
-    let parameters = parameters(feature::params::PARAMETERS);
+    let settings = feature::Settings {
+        parameters: parameters(feature::params::PARAMETERS),
+        health: Arc::clone(health),
+        activity: Activity::always(),
+    };
     let (images, _) = mpsc::channel(0);
     let overlays = feature::Overlays { images, wanted: Box::new(|| false) };
-    smol::block_on(feature::run(stream::iter(pieces), sender, overlays, parameters, Arc::clone(health)));
+    smol::block_on(feature::run(stream::iter(pieces), sender, overlays, settings));
     smol::block_on(receiver.collect())
 }
 
@@ -106,11 +115,19 @@ fn run_solver_with_goals(
     let (marker, markers) = mpsc::channel(room);
     let (solutions, _) = mpsc::unbounded();
     let outputs = solver::Outputs { assembly, transforms: transform, markers: marker, solutions };
-    let parameters = parameters(solver::params::PARAMETERS);
-    let requests =
-        solver::Requests { resets: stream::iter(resets), solves: stream::empty(), goals: stream::iter(goals) };
+    let settings = solver::Settings {
+        parameters: parameters(solver::params::PARAMETERS),
+        health: Arc::clone(health),
+        activity: Activity::always(),
+    };
+    let requests = solver::Requests {
+        resets: stream::iter(resets),
+        solves: stream::empty(),
+        goals: stream::iter(goals),
+        forgets: stream::empty(),
+    };
     smol::block_on(async {
-        solver::run(stream::iter(features), requests, outputs, parameters, Arc::clone(health)).await;
+        solver::run(stream::iter(features), requests, outputs, settings).await;
         Published {
             assemblies: assemblies.collect().await,
             transforms: transforms.collect().await,
@@ -340,7 +357,7 @@ fn goal(expected_pieces: u32) -> (solver::AssembleGoal, mpsc::Receiver<AssembleF
     let (feedback, feedbacks) = mpsc::channel(100);
     let (finish, finished) = oneshot::channel();
     let (_, cancelled) = oneshot::channel();
-    let goal = solver::convert::AssembleGoal { expected_pieces, ..Default::default() };
+    let goal = AssembleGoal { expected_pieces, ..Default::default() };
     (Goal { goal, feedback, finish, cancelled }, feedbacks, finished)
 }
 
@@ -363,14 +380,12 @@ fn a_goal_succeeds_when_every_expected_piece_is_placed() {
 }
 
 #[test]
-fn a_goal_has_the_bytes_of_its_message() {
-    let message = jigsaw_msgs::action::AssembleGoal {
-        expected_pieces: 24,
-        time_budget: jigsaw_msgs::builtin_interfaces::msg::Duration { sec: 3, nanosec: 5 },
-    };
-    let goal = solver::convert::AssembleGoal { expected_pieces: 24, budget_sec: 3, budget_nanosec: 5 };
-    let of_message = cdr_encoding::to_vec::<_, byteorder::LittleEndian>(&message).unwrap();
-    let of_goal = cdr_encoding::to_vec::<_, byteorder::LittleEndian>(&goal).unwrap();
-    assert_eq!(of_message, of_goal);
-    assert_eq!(goal.budget(), Some(std::time::Duration::new(3, 5)));
+fn a_goal_with_a_time_that_is_none_is_rejected() {
+    let goal = |sec, nanosec| AssembleGoal { time_budget: Duration { sec, nanosec }, ..Default::default() };
+    assert_eq!(solver::convert::budget(&goal(3, 5)), Ok(Some(std::time::Duration::new(3, 5))));
+    assert_eq!(solver::convert::budget(&goal(0, 0)), Ok(None));
+    for (sec, nanosec) in [(-1, 0), (0, 1_000_000_000), (i32::MIN, u32::MAX)] {
+        let said = solver::convert::budget(&goal(sec, nanosec)).unwrap_err().to_string();
+        assert!(said.contains("time_budget") && said.contains(&sec.to_string()), "{said}");
+    }
 }

@@ -42,6 +42,18 @@ pub enum FrameError {
         /// Rows.
         height: u32,
     },
+    /// A header that is none.
+    #[error("{source_name}: {field} is {value}: must be {rule}")]
+    Header {
+        /// Topic.
+        source_name: String,
+        /// The field.
+        field: &'static str,
+        /// Its value.
+        value: String,
+        /// What it must be.
+        rule: &'static str,
+    },
     /// An encoding that is not read.
     #[error("{source_name}: encoding '{encoding}': must be one of {}", ENCODINGS.map(|(name, ..)| name).join(", "))]
     Encoding {
@@ -101,6 +113,7 @@ impl FrameError {
     pub fn kind(&self) -> &'static str {
         match self {
             Self::Size { .. } => "size",
+            Self::Header { field, .. } => field,
             Self::Encoding { .. } => "encoding",
             Self::Step { .. } => "step",
             Self::Data { .. } => "data",
@@ -108,6 +121,50 @@ impl FrameError {
             Self::NoPiece { .. } => "no_piece",
         }
     }
+}
+
+/// Longest name of a frame or a source, in bytes; far more than anyone writes, and little enough to be kept.
+pub const MAX_NAME_LENGTH: usize = 1024;
+
+/// Most characters of a text that a refusal repeats.
+const MOST_SHOWN: usize = 40;
+
+/// A text of someone else's as a refusal repeats it: not longer than a line, without control characters.
+pub fn shown(text: &str) -> String {
+    let mut short: String =
+        text.chars().take(MOST_SHOWN).map(|c| if c.is_control() { char::REPLACEMENT_CHARACTER } else { c }).collect();
+    if short.len() < text.len() {
+        short.push('…');
+    }
+    short
+}
+
+/// A field that breaks a rule: field, value, rule.
+pub type Fault = (&'static str, String, &'static str);
+
+/// Whether a text can be taken over into messages and logs.
+pub fn text_fault(field: &'static str, text: &str) -> Option<Fault> {
+    let fits = text.len() <= MAX_NAME_LENGTH && !text.chars().any(char::is_control);
+    (!fits).then(|| (field, format!("'{}'", shown(text)), "at most 1024 bytes without control characters"))
+}
+
+/// What is wrong with a header, if anything. Its time may lie years back (as a bag's does) or before that of the message
+/// before it.
+pub fn header_fault(header: &Header) -> Option<Fault> {
+    const NANOS: u32 = 1_000_000_000;
+    let Time { sec, nanosec } = header.stamp;
+    if sec < 0 {
+        return Some(("header.stamp.sec", sec.to_string(), "0 or more"));
+    }
+    if nanosec >= NANOS {
+        return Some(("header.stamp.nanosec", nanosec.to_string(), "less than 1000000000"));
+    }
+    text_fault("header.frame_id", &header.frame_id)
+}
+
+fn check_header(source_name: &str, header: &Header) -> Result<(), FrameError> {
+    let fault = |(field, value, rule)| FrameError::Header { source_name: source_name.to_owned(), field, value, rule };
+    header_fault(header).map_or(Ok(()), |found| Err(fault(found)))
 }
 
 /// How the bytes of a pixel are meant.
@@ -152,11 +209,13 @@ pub struct Picture {
 pub fn picture(frame: Frame) -> Result<Picture, FrameError> {
     match frame {
         Frame::Raw(topic, image) => {
+            check_header(&topic, &image.header)?;
             let pixels = raw_pixels(&topic, &image)?;
             let name = FrameName::Stamp(topic, image.header.stamp.sec, image.header.stamp.nanosec);
             Ok(Picture { name, content: hash(&image.data), header: image.header, pixels })
         }
         Frame::Compressed(topic, image) => {
+            check_header(&topic, &image.header)?;
             let pixels = decode(&topic, &image)?;
             let name = FrameName::Stamp(topic, image.header.stamp.sec, image.header.stamp.nanosec);
             Ok(Picture { name, content: hash(&image.data), header: image.header, pixels })
@@ -184,7 +243,7 @@ fn raw_pixels(topic: &str, image: &Image) -> Result<DynamicImage, FrameError> {
     let (width, height, step) = (image.width, image.height, image.step);
     check_size(topic, width, height)?;
     let Some(&(_, layout, bytes)) = ENCODINGS.iter().find(|(name, ..)| *name == image.encoding) else {
-        return Err(FrameError::Encoding { source_name: topic.to_owned(), encoding: image.encoding.clone() });
+        return Err(FrameError::Encoding { source_name: topic.to_owned(), encoding: shown(&image.encoding) });
     };
     let row_bytes = u64::from(width) * u64::from(bytes);
     if u64::from(step) < row_bytes {
@@ -404,7 +463,13 @@ mod tests {
     #[test]
     fn nonsense_is_refused_by_field_and_rule() {
         let good = image("mono8", 1, &[1, 2, 3, 4]);
-        let cases: [(Image, &str); 7] = [
+        let stamped = |sec, nanosec| Header { stamp: Time { sec, nanosec }, frame_id: String::new() };
+        let named = |frame_id: String| Header { frame_id, ..Header::default() };
+        let cases: [(Image, &str); 11] = [
+            (Image { header: stamped(-1, 0), ..good.clone() }, "header.stamp.sec is -1: must be 0 or more"),
+            (Image { header: stamped(1, u32::MAX), ..good.clone() }, "header.stamp.nanosec is 4294967295"),
+            (Image { header: named("x".repeat(100_000)), ..good.clone() }, "header.frame_id is 'xxx"),
+            (Image { header: named("a\nb".into()), ..good.clone() }, "without control characters"),
             (Image { width: 0, ..good.clone() }, "size 0x2"),
             (Image { height: u32::MAX, ..good.clone() }, "size 2x4294967295"),
             (Image { width: 30_000, height: 30_000, ..good.clone() }, "area at most"),
@@ -416,7 +481,14 @@ mod tests {
         for (bad, said) in cases {
             let message = read(bad).unwrap_err().to_string();
             assert!(message.contains(said) && message.starts_with("/image: "), "{message}");
+            assert!(message.len() < 300 && !message.chars().any(char::is_control), "{message}");
         }
+    }
+
+    #[test]
+    fn a_stamp_may_lie_years_back() {
+        let old = Header { stamp: Time { sec: 0, nanosec: 1 }, frame_id: "camera".into() };
+        assert!(read(Image { header: old, ..image("mono8", 1, &[1, 2, 3, 4]) }).is_ok());
     }
 
     #[test]

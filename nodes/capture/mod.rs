@@ -11,10 +11,11 @@ pub mod source;
 
 use std::collections::VecDeque;
 use std::hash::{DefaultHasher, Hash, Hasher};
+use std::path::PathBuf;
 use std::sync::Arc;
 
 use futures::channel::mpsc;
-use futures::stream::{self, BoxStream};
+use futures::stream::{self, LocalBoxStream};
 use futures::{Sink, SinkExt, Stream, StreamExt};
 use isthmus::mask::{self, Cutout};
 use jigsaw_msgs::builtin_interfaces::msg::Time;
@@ -22,6 +23,7 @@ use jigsaw_msgs::msg::PieceImage;
 use jigsaw_msgs::std_srvs::srv::{Trigger, TriggerResponse};
 
 use crate::ros::health::Health;
+use crate::ros::lifecycle::{Activity, Forget, WhileInactive};
 use crate::ros::params::Parameters;
 use crate::ros::process::{ProcessError, Program, Work};
 use crate::ros::session::{Call, Session};
@@ -47,6 +49,8 @@ pub struct Settings {
     pub parameters: Arc<Parameters>,
     /// Counters.
     pub health: Arc<Health>,
+    /// Whether the node works.
+    pub activity: Activity,
 }
 
 /// A frame after the workers.
@@ -85,15 +89,15 @@ impl Heard {
 /// # Errors
 /// An empty or missing folder; a name that is no name; a refusal of the middleware.
 pub fn open(mut session: Session, pieces: impl Sink<PieceImage> + Unpin + 'static) -> Result<Work, ProcessError> {
-    let settings = Settings { parameters: Arc::clone(&session.parameters), health: Arc::clone(&session.health) };
+    let settings = Settings {
+        parameters: Arc::clone(&session.parameters),
+        health: Arc::clone(&session.health),
+        activity: session.activity.clone(),
+    };
     let calls = session.serve::<Trigger>(topics::CAPTURE_SERVICE)?;
-    let frames: BoxStream<'static, Frame> = match params::source_folder(&session.parameters) {
-        Some(folder) => {
-            let files = source::pictures(&folder)
-                .map_err(|e| ProcessError::Configuration(format!("parameter '{}': {e}", params::SOURCE.name)))?;
-            log::info!("{} pictures in {}", files.len(), folder.display());
-            stream::iter(files.into_iter().map(Frame::File)).boxed()
-        }
+    let folder = params::source_folder(&session.parameters);
+    let frames: LocalBoxStream<'static, Frame> = match folder.clone() {
+        Some(folder) => session.activity.gate(folder_frames(folder, &settings), WhileInactive::Hold),
         None => {
             let (raw_name, compressed_name) =
                 (session.names().topic(topics::IMAGE.name)?, session.names().topic(topics::IMAGE_COMPRESSED.name)?);
@@ -111,40 +115,76 @@ pub fn open(mut session: Session, pieces: impl Sink<PieceImage> + Unpin + 'stati
             let mut heard = Heard::default();
             let compressed = stream::select_all(compressed)
                 .filter(move |image| std::future::ready(heard.is_new(&image.header.stamp, &image.data)));
-            stream::select(
+            let frames = stream::select(
                 raw.map(move |image| Frame::Raw(raw_name.clone(), image)),
                 compressed.map(move |image| Frame::Compressed(compressed_name.clone(), image)),
-            )
-            .boxed()
+            );
+            session.activity.gate(frames, WhileInactive::Drop)
         }
     };
+    let forgets = session.manage(move || match &folder {
+        Some(folder) => {
+            source::pictures(folder).map(drop).map_err(|e| format!("parameter '{}': {e}", params::SOURCE.name))
+        }
+        None => Ok(()),
+    })?;
     Ok(Box::pin(async move {
         // The session is kept: its topics and services end with it.
-        run(frames, calls, pieces, settings).await;
+        run(frames, Requests { calls, forgets }, pieces, settings).await;
         drop(session);
         Ok(())
     }))
 }
 
-/// The node's loop. Ends when frames and calls have ended.
+/// The pictures of a folder, listed when they are first asked for.
+fn folder_frames(folder: PathBuf, settings: &Settings) -> impl Stream<Item = Frame> + Unpin + 'static {
+    let health = Arc::clone(&settings.health);
+    let listed = stream::once(async move {
+        let files = match source::pictures(&folder) {
+            Ok(files) => {
+                log::info!("{} pictures in {}", files.len(), folder.display());
+                files
+            }
+            Err(e) => {
+                health.warn("folder", &e.to_string());
+                Vec::new()
+            }
+        };
+        stream::iter(files.into_iter().map(Frame::File))
+    });
+    Box::pin(listed.flatten())
+}
+
+/// What others may ask for.
+#[derive(Debug)]
+pub struct Requests<C, F> {
+    /// Calls of `capture`.
+    pub calls: C,
+    /// Wishes to forget the pieces seen so far.
+    pub forgets: F,
+}
+
+/// The node's loop. Ends when frames and requests have ended.
 pub async fn run(
     frames: impl Stream<Item = Frame> + Unpin,
-    calls: impl Stream<Item = Call<Trigger>> + Unpin,
+    requests: Requests<impl Stream<Item = Call<Trigger>> + Unpin, impl Stream<Item = Forget> + Unpin>,
     mut pieces: impl Sink<PieceImage> + Unpin,
     settings: Settings,
 ) {
-    let Settings { parameters, health } = settings;
+    let Settings { parameters, health, activity } = settings;
     let threads = params::threads(&parameters, &params::THREADS);
     // Files that a call wants read again come in beside the frames.
     let (again, more) = mpsc::unbounded();
     let mut again = Some(again);
     let mut seen = stream::select(frames, more).map(|frame| smol::unblock(move || cut_out(frame))).buffered(threads);
-    let mut calls = calls.fuse();
+    let (mut calls, mut forgets) = (requests.calls.fuse(), requests.forgets.fuse());
     let mut known = Known::default();
     let mut latest: Vec<PieceImage> = Vec::new();
     loop {
         futures::select! {
             frame = seen.next() => match frame {
+                // It was under way when the node was told to stop.
+                Some(Ok(_)) if !activity.is_active() => {}
                 Some(Ok(frame)) => {
                     health.received();
                     latest = name_pieces(&mut known, frame, &parameters, &health, &mut pieces).await;
@@ -155,6 +195,7 @@ pub async fn run(
             call = calls.next() => match call {
                 Some(call) => {
                     let answer = match (params::source_folder(&parameters), &again) {
+                        _ if !activity.is_active() => inactive(),
                         (Some(folder), Some(again)) => reread(&folder, again),
                         _ => publish_again(&latest, &health, &mut pieces).await,
                     };
@@ -163,9 +204,19 @@ pub async fn run(
                 }
                 None => again = None,
             },
+            forget = forgets.next() => if let Some(forget) = forget {
+                known = Known::default();
+                latest.clear();
+                let _ = forget.send(());
+            },
             complete => break,
         }
     }
+}
+
+/// The answer to a call that comes while the node does not work.
+pub(crate) fn inactive() -> TriggerResponse {
+    TriggerResponse { success: false, message: "the node is not active".to_owned() }
 }
 
 /// Names the pieces of a frame, publishes the new ones, and gives all of them for the `capture` service.

@@ -10,7 +10,7 @@ use jigsaw_msgs::msg::{Isthmus as IsthmusMessage, PieceFeatures, PieceImage, Ske
 use jigsaw_msgs::sensor_msgs::msg::Image;
 use jigsaw_msgs::std_msgs::msg::Header;
 
-use crate::capture::convert::{MAX_AREA_PX, MAX_SIDE_PX};
+use crate::capture::convert::{MAX_AREA_PX, MAX_SIDE_PX, header_fault, shown, text_fault};
 
 /// Samples of an isthmus distance function in the message: what the paper's plots show, and what 4-byte floats of a
 /// match segment of common length (some 100 px) can tell apart.
@@ -59,6 +59,13 @@ impl PieceImageError {
 /// Longest name of a piece, in bytes; coordinate frames carry it.
 pub const MAX_ID_LENGTH: usize = 200;
 
+/// Scales that make sense, in metres a pixel: from an electron microscope to a picture of the Earth. Others would become
+/// zero or infinite as the messages' single precision numbers.
+pub const SCALES: std::ops::RangeInclusive<f64> = 1e-9..=1e3;
+
+/// [`SCALES`] in words.
+pub const SCALE_RULE: &str = "1e-9 to 1000";
+
 /// Whether a piece may be called so: its name is a part of the name of a coordinate frame.
 pub fn is_piece_id(id: &str) -> bool {
     (1..=MAX_ID_LENGTH).contains(&id.len()) && !id.chars().any(|c| c == '/' || c.is_whitespace() || c.is_control())
@@ -71,7 +78,11 @@ pub fn is_piece_id(id: &str) -> bool {
 pub fn cutout(message: &mut PieceImage) -> Result<Cutout, PieceImageError> {
     let id = message.id.clone();
     if !is_piece_id(&id) {
-        return Err(PieceImageError::Id(id.chars().take(MAX_ID_LENGTH).collect()));
+        return Err(PieceImageError::Id(shown(&id)));
+    }
+    if let Some((field, value, rule)) = header_fault(&message.header).or_else(|| text_fault("source", &message.source))
+    {
+        return Err(PieceImageError::Range { id, field, value, rule });
     }
     let image = &mut message.image;
     let (width, height) = (image.width, image.height);
@@ -79,7 +90,7 @@ pub fn cutout(message: &mut PieceImage) -> Result<Cutout, PieceImageError> {
         let value = value.to_string();
         if holds { Ok(()) } else { Err(PieceImageError::Range { id: id.clone(), field, value, rule }) }
     };
-    check("image.encoding", image.encoding == "mono8", &image.encoding, "mono8")?;
+    check("image.encoding", image.encoding == "mono8", &shown(&image.encoding), "mono8")?;
     let sides = 1..=MAX_SIDE_PX;
     check("image.width", sides.contains(&width), &width, "1 to 32768")?;
     check("image.height", sides.contains(&height), &height, "1 to 32768")?;
@@ -94,10 +105,18 @@ pub fn cutout(message: &mut PieceImage) -> Result<Cutout, PieceImageError> {
     check("aoi_y_px", side(message.aoi_y_px), &message.aoi_y_px, "-32768 to 32768")?;
     check("aoi_width_px", (1..=width).contains(&message.aoi_width_px), &message.aoi_width_px, "1 to image.width")?;
     check("aoi_height_px", (1..=height).contains(&message.aoi_height_px), &message.aoi_height_px, "1 to image.height")?;
+    let inside = |from: i32, length: u32, window: i32, side: u32| {
+        from >= window && i64::from(from) + i64::from(length) <= i64::from(window) + i64::from(side)
+    };
+    let (x, y) = (message.aoi_x_px, message.aoi_y_px);
+    let inside_x = inside(x, message.aoi_width_px, message.image_x_px, width);
+    let inside_y = inside(y, message.aoi_height_px, message.image_y_px, height);
+    check("aoi_x_px", inside_x, &x, "so that the AOI lies inside the picture, from image_x_px on")?;
+    check("aoi_y_px", inside_y, &y, "so that the AOI lies inside the picture, from image_y_px on")?;
     check("frame_width_px", sides.contains(&message.frame_width_px), &message.frame_width_px, "1 to 32768")?;
     check("frame_height_px", sides.contains(&message.frame_height_px), &message.frame_height_px, "1 to 32768")?;
     let scale = message.metres_per_pixel;
-    check("metres_per_pixel", scale.is_finite() && scale > 0.0, &scale, "a positive number")?;
+    check("metres_per_pixel", SCALES.contains(&scale), &scale, SCALE_RULE)?;
     let grey = 0.0..=255.0;
     check("piece_level", grey.contains(&message.piece_level), &message.piece_level, "0 to 255")?;
     check("ground_level", grey.contains(&message.ground_level), &message.ground_level, "0 to 255")?;

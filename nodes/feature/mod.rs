@@ -14,6 +14,7 @@ use jigsaw_msgs::sensor_msgs::msg::Image;
 use crate::capture::params::threads;
 use crate::picture::{InspectionStyle, inspection};
 use crate::ros::health::Health;
+use crate::ros::lifecycle::{Activity, Forget, WhileInactive};
 use crate::ros::params::Parameters;
 use crate::ros::process::{ProcessError, Program, Work};
 use crate::ros::session::{Audience, Session};
@@ -47,6 +48,17 @@ impl Overlays {
     }
 }
 
+/// What the loop needs beside its streams.
+#[derive(Debug, Clone)]
+pub struct Settings {
+    /// Parameters.
+    pub parameters: Arc<Parameters>,
+    /// Counters.
+    pub health: Arc<Health>,
+    /// Whether the node works.
+    pub activity: Activity,
+}
+
 /// Opens the node and gives its loop.
 ///
 /// # Errors
@@ -58,9 +70,20 @@ pub fn open(
 ) -> Result<Work, ProcessError> {
     let (images, audience) = session.publish(&topics::OVERLAY)?;
     let overlays = Overlays::new(images, audience);
-    let (parameters, health) = (Arc::clone(&session.parameters), Arc::clone(&session.health));
+    let settings = Settings {
+        parameters: Arc::clone(&session.parameters),
+        health: Arc::clone(&session.health),
+        activity: session.activity.clone(),
+    };
+    let pieces = session.activity.gate(pieces, WhileInactive::Hold);
+    let forgets = session.manage(|| Ok(()))?;
+    // There is nothing to forget: each piece is looked at on its own.
+    session.spawn(forgets.for_each(|forget: Forget| {
+        let _ = forget.send(());
+        std::future::ready(())
+    }));
     Ok(Box::pin(async move {
-        run(pieces, features, overlays, parameters, health).await;
+        run(pieces, features, overlays, settings).await;
         drop(session);
         Ok(())
     }))
@@ -71,9 +94,9 @@ pub async fn run(
     pieces: impl Stream<Item = PieceImage> + Unpin,
     mut features: impl Sink<PieceFeatures> + Unpin,
     mut overlays: Overlays,
-    parameters: Arc<Parameters>,
-    health: Arc<Health>,
+    settings: Settings,
 ) {
+    let Settings { parameters, health, activity } = settings;
     let threads = threads(&parameters, &params::THREADS);
     let wanted = overlays.wanted;
     let mut extracted = pieces
@@ -88,6 +111,8 @@ pub async fn run(
                 health.received();
                 health.state("analysing pieces");
                 log::debug!("piece {}: {} isthmuses", message.id, message.isthmuses.len());
+                // The work on it may have begun before the node was told to stop.
+                activity.active().await;
                 if features.send(message).await.is_ok() {
                     health.published();
                 }

@@ -21,6 +21,7 @@ struct Inner {
     published: u64,
     refused: BTreeMap<&'static str, u64>,
     state: String,
+    lifecycle: String,
     last_error: Option<(Instant, String)>,
     figures: BTreeMap<&'static str, String>,
     throttle: Throttle,
@@ -29,6 +30,14 @@ struct Inner {
 
 /// How long after the last refusal or error a node still reports a warning.
 const WARNING_SECONDS: u64 = 10;
+
+/// Label of the state in which a node works; see [`super::lifecycle`].
+const ACTIVE: &str = "active";
+
+/// On which host the node runs; several may share the work.
+fn host_name() -> String {
+    nix::unistd::gethostname().map(|name| name.to_string_lossy().into_owned()).unwrap_or_default()
+}
 
 impl Health {
     /// Counters of the node of this full name, all at zero.
@@ -40,6 +49,7 @@ impl Health {
                 published: 0,
                 refused: BTreeMap::new(),
                 state: "waiting for input".to_owned(),
+                lifecycle: ACTIVE.to_owned(),
                 last_error: None,
                 figures: BTreeMap::new(),
                 throttle: Throttle::default(),
@@ -82,6 +92,11 @@ impl Health {
         }
     }
 
+    /// Says in which state of the lifecycle the node is.
+    pub fn lifecycle(&self, label: &str) {
+        label.clone_into(&mut self.inner().lifecycle);
+    }
+
     /// Sets a figure of the report.
     pub fn figure(&self, name: &'static str, value: impl ToString) {
         self.inner().figures.insert(name, value.to_string());
@@ -100,6 +115,8 @@ impl Health {
         let seconds = now.duration_since(then).as_secs_f64().max(f64::EPSILON);
         let rate = |count: u64, before: u64| format!("{:.1}", (count - before) as f64 / seconds);
         let mut values = vec![
+            ("lifecycle", inner.lifecycle.clone()),
+            ("state", inner.state.clone()),
             ("received", inner.received.to_string()),
             ("received_per_second", rate(inner.received, received)),
             ("published", inner.published.to_string()),
@@ -125,8 +142,10 @@ impl Health {
         DiagnosticStatus {
             level: if recent.is_some() { DiagnosticStatus::WARN } else { DiagnosticStatus::OK },
             name: self.node.trim_start_matches('/').to_owned(),
-            message: recent.unwrap_or_else(|| inner.state.clone()),
-            hardware_id: String::new(),
+            message: recent.unwrap_or_else(|| {
+                if inner.lifecycle == ACTIVE { inner.state.clone() } else { inner.lifecycle.clone() }
+            }),
+            hardware_id: host_name(),
             values,
         }
     }
@@ -162,6 +181,7 @@ mod tests {
         health.refuse("border", "border of 'a' holds NaN");
         health.refuse("border", "border of 'b' holds NaN");
         health.figure("pieces", 3);
+        health.lifecycle("inactive");
         let report = health.report();
         assert_eq!(report.name, "cell/solver_node");
         assert_eq!(report.level, DiagnosticStatus::WARN);
@@ -170,5 +190,8 @@ mod tests {
         assert_eq!(value(&report, "refused.border"), "2");
         assert_eq!(value(&report, "received"), "1");
         assert_eq!(value(&report, "pieces"), "3");
+        assert_eq!(value(&report, "lifecycle"), "inactive");
+        assert_eq!(report.hardware_id, host_name());
+        assert!(!report.hardware_id.is_empty());
     }
 }

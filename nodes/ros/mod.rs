@@ -6,6 +6,8 @@
 //! | [`args`] | the command line of ROS: remapping, parameters, names |
 //! | [`params`] | declaration, check and documentation of parameters |
 //! | [`services`] | the six parameter services |
+//! | [`lifecycle`] | states and transitions of a managed node |
+//! | `server` | one service: requests in, answers out |
 //! | [`topics`] | every topic: message type, name, quality of service |
 //! | [`raw`] | topics whose type is known by name only |
 //! | [`session`] | one node: opens topics and services as streams and sinks |
@@ -17,10 +19,12 @@
 pub mod actions;
 pub mod args;
 pub mod health;
+pub mod lifecycle;
 pub mod logging;
 pub mod params;
 pub mod process;
 pub mod raw;
+mod server;
 pub mod services;
 pub mod session;
 pub mod topics;

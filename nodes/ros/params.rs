@@ -201,6 +201,12 @@ impl Parameters {
         Self { node: node.to_owned(), specs, values: RwLock::new(values), watchers: Mutex::new(Vec::new()) }
     }
 
+    /// Every parameter with its value.
+    pub fn all(&self) -> Vec<(String, ParameterValue)> {
+        let values = self.values.read().unwrap_or_else(PoisonError::into_inner);
+        self.specs.iter().zip(values.iter()).map(|(spec, value)| (spec.name.to_owned(), value.clone())).collect()
+    }
+
     /// Takes over the values of the command line and of parameter files. A whole number is taken for a `double`, and a
     /// number for a `string`, because YAML can't tell what was meant.
     ///

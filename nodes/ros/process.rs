@@ -20,8 +20,10 @@ use std::time::Duration;
 
 use futures::future::LocalBoxFuture;
 use futures::{FutureExt, SinkExt, StreamExt};
+use jigsaw_msgs::builtin_interfaces::msg::Time;
 use jigsaw_msgs::diagnostic_msgs::msg::DiagnosticArray;
 use jigsaw_msgs::std_msgs::msg::Header;
+use nix::sys::resource::{Resource, getrlimit, setrlimit};
 use nix::sys::signal::{SigSet, Signal};
 use ros2_client::{Context, NodeName, NodeOptions};
 use rustdds::dds::statusevents::{DomainParticipantStatusEvent, StatusEvented};
@@ -29,6 +31,7 @@ use rustdds::{DomainParticipant, DomainParticipantBuilder};
 
 use super::args::{ArgsError, RosArgs, domain_id};
 use super::health::Health;
+use super::lifecycle::{AUTOSTART, Activity};
 use super::params::{Default as DefaultValue, ParameterError, Parameters, Rule, Spec};
 use super::session::{Clock, Endpoints, Session, SessionError};
 use super::{logging, services, topics};
@@ -53,8 +56,19 @@ pub const NETWORK_INTERFACES: Spec = Spec {
     read_only: true,
 };
 
+/// How much memory the process may take.
+pub const MAXIMUM_MEMORY: Spec = Spec {
+    name: "maximum_memory",
+    default: DefaultValue::Integer(4096),
+    unit: "MiB",
+    rule: Rule::Integers(0, 1 << 20),
+    description: "Address space that the process may take; beyond it ends, to be started again, so that malformed network \
+                  packets can't take all memory; 0 for no limit.",
+    read_only: true,
+};
+
 /// The parameters every node has.
-pub const COMMON_PARAMETERS: &[Spec] = &[USE_SIM_TIME, NETWORK_INTERFACES];
+pub const COMMON_PARAMETERS: &[Spec] = &[AUTOSTART, USE_SIM_TIME, NETWORK_INTERFACES, MAXIMUM_MEMORY];
 
 /// How often the watchdog looks.
 const WATCH_PERIOD: Duration = Duration::from_millis(500);
@@ -256,6 +270,7 @@ impl Process {
             parameters: table,
             health,
             clock: Clock::default(),
+            activity: Activity::default(),
         };
         services::open(&mut session)?;
         follow_clock(&mut session)?;
@@ -309,6 +324,7 @@ impl Process {
         if let Some((_, context)) = &self.participant {
             return Ok(context.clone());
         }
+        limit_memory(parameters)?;
         let domain = domain_id(std::env::var("ROS_DOMAIN_ID").ok().as_deref())?;
         let mut builder = DomainParticipantBuilder::new(domain);
         let addresses = interfaces(parameters, |variable| std::env::var(variable).ok())?;
@@ -329,6 +345,16 @@ fn signals() -> SigSet {
     signals.add(Signal::SIGINT);
     signals.add(Signal::SIGTERM);
     signals
+}
+
+/// Sets the limit of the address space, unless a lower one is in force.
+fn limit_memory(parameters: &Parameters) -> Result<(), ProcessError> {
+    let failed = |e: nix::Error| ProcessError::System { what: "limiting the memory", reason: e.to_string() };
+    let Some(limit) = u64::try_from(parameters.integer(&MAXIMUM_MEMORY)).ok().filter(|&mebibytes| mebibytes > 0) else {
+        return Ok(());
+    };
+    let (_, hard) = getrlimit(Resource::RLIMIT_AS).map_err(failed)?;
+    setrlimit(Resource::RLIMIT_AS, (limit << 20).min(hard), hard).map_err(failed)
 }
 
 /// The addresses that the parameter or the environment restricts the middleware to; none for no restriction.
@@ -359,7 +385,9 @@ fn interfaces(
 /// Keeps the session's clock at `/clock` while `use_sim_time` is set.
 fn follow_clock(session: &mut Session) -> Result<(), SessionError> {
     let mut ticks = session.subscribe(&topics::CLOCK)?;
+    const NANOS: u32 = 1_000_000_000;
     let (clock, parameters) = (session.clock.clone(), Arc::clone(&session.parameters));
+    let health = Arc::clone(&session.health);
     let mut changes = parameters.changes();
     let simulated = parameters.bool(&USE_SIM_TIME);
     clock.set(simulated.then(Default::default));
@@ -367,6 +395,12 @@ fn follow_clock(session: &mut Session) -> Result<(), SessionError> {
         loop {
             futures::select! {
                 tick = ticks.next() => match tick {
+                    Some(tick) if tick.clock.sec < 0 || tick.clock.nanosec >= NANOS => {
+                        let Time { sec, nanosec } = tick.clock;
+                        health.refuse("clock", &format!(
+                            "/clock: {sec} s and {nanosec} ns: must be 0 s or more, and less than {NANOS} ns"
+                        ));
+                    }
                     Some(tick) if parameters.bool(&USE_SIM_TIME) => clock.set(Some(tick.clock)),
                     Some(_) => {}
                     None => break,

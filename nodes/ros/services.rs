@@ -11,11 +11,11 @@ use ros2_client::rcl_interfaces::{
     GetParametersRequest, GetParametersResponse, ListParametersRequest, ListParametersResponse, ListParametersResult,
     SetParametersAtomicallyResponse, SetParametersRequest, SetParametersResponse,
 };
-use ros2_client::{Message, ParameterValue, Publisher, ServiceMapping, ServiceTypeName, builtin_interfaces};
+use ros2_client::{Message, ParameterValue, Publisher, builtin_interfaces};
 
+use super::health::Health;
 use super::params::Parameters;
-use super::session::{Session, SessionError, dds_name};
-use super::topics::SERVICE_QOS;
+use super::session::{Clock, Session, SessionError};
 
 /// Opens the services of a node's parameters.
 pub(super) fn open(session: &mut Session) -> Result<(), SessionError> {
@@ -23,52 +23,37 @@ pub(super) fn open(session: &mut Session) -> Result<(), SessionError> {
         .node
         .create_publisher::<raw::ParameterEvent>(&session.context.get_parameter_events_topic(), None)
         .map_err(|e| SessionError::middleware("publisher of /parameter_events", e))?;
-    let events = &Rc::new(events);
+    let changes = Rc::new(Changes { events, health: Arc::clone(&session.health), clock: session.clock.clone() });
+    changes.tell(&session.parameters, |event, values| event.new_parameters = values, session.parameters.all());
     serve(session, "GetParameters", "get_parameters", get)?;
     serve(session, "GetParameterTypes", "get_parameter_types", get_types)?;
     serve(session, "ListParameters", "list_parameters", list)?;
     serve(session, "DescribeParameters", "describe_parameters", describe)?;
-    let publisher = Rc::clone(events);
+    let one_by_one = Rc::clone(&changes);
     serve(session, "SetParameters", "set_parameters", move |parameters, request: SetParametersRequest| {
-        let results = request.parameter.into_iter().map(|one| set(parameters, &publisher, vec![one])).collect();
+        let results = request.parameter.into_iter().map(|one| one_by_one.set(parameters, vec![one])).collect();
         SetParametersResponse { results }
     })?;
-    let publisher = Rc::clone(events);
     serve(session, "SetParametersAtomically", "set_parameters_atomically", move |parameters, request| {
         let request: SetParametersRequest = request;
-        SetParametersAtomicallyResponse { result: set(parameters, &publisher, request.parameter) }
+        SetParametersAtomicallyResponse { result: changes.set(parameters, request.parameter) }
     })
 }
 
-fn serve<Req: Message + Clone + 'static, Resp: Message + 'static>(
+fn serve<Req: Message + 'static, Resp: Message + 'static>(
     session: &mut Session,
     service_type: &str,
     name: &str,
     answer: impl Fn(&Parameters, Req) -> Resp + 'static,
 ) -> Result<(), SessionError> {
     let name = session.names.service(&format!("~/{name}"))?;
-    let server = session
-        .node
-        .create_server::<Req, Resp>(
-            ServiceMapping::Enhanced,
-            &dds_name(&name)?,
-            &ServiceTypeName::new("rcl_interfaces", service_type),
-            SERVICE_QOS,
-            SERVICE_QOS,
-        )
-        .map_err(|e| SessionError::middleware(format!("service {name}"), e))?;
-    let (parameters, health) = (Arc::clone(&session.parameters), Arc::clone(&session.health));
+    let types = ["Request", "Response"].map(|end| format!("rcl_interfaces::srv::dds_::{service_type}_{end}_"));
+    let mut calls = session.open_server(&name, types, |request: Req, reply| (request, reply))?;
+    let parameters = Arc::clone(&session.parameters);
     session.spawn(async move {
-        let mut requests = server.receive_request_stream();
-        while let Some(request) = requests.next().await {
-            match request {
-                Ok((id, request)) => {
-                    if let Err(e) = server.async_send_response(id, answer(&parameters, request)).await {
-                        health.warn("write", &format!("the answer of {name} was not written: {e}"));
-                    }
-                }
-                Err(e) => health.refuse("undecodable", &format!("request of {name} can't be decoded: {e}")),
-            }
+        while let Some((request, reply)) = calls.next().await {
+            // A caller that has gone is no concern of the node.
+            let _ = reply.send(answer(&parameters, request));
         }
     });
     Ok(())
@@ -112,37 +97,50 @@ fn list(parameters: &Parameters, request: ListParametersRequest) -> ListParamete
     ListParametersResponse { result: ListParametersResult { names, prefixes: Vec::new() } }
 }
 
-fn set(
-    parameters: &Parameters,
-    events: &Publisher<raw::ParameterEvent>,
-    changes: Vec<raw::Parameter>,
-) -> raw::SetParametersResult {
-    let changes: Vec<(String, ParameterValue)> =
-        changes.into_iter().map(|change| (change.name, change.value.into())).collect();
-    let borrowed: Vec<(&str, &ParameterValue)> = changes.iter().map(|(name, value)| (name.as_str(), value)).collect();
-    match parameters.set_all(&borrowed) {
-        Ok(()) => {
-            report(parameters, events, changes);
-            raw::SetParametersResult { successful: true, reason: String::new() }
-        }
-        Err(refusal) => {
-            log::warn!("{refusal}");
-            raw::SetParametersResult { successful: false, reason: refusal.to_string() }
-        }
-    }
+/// Sets parameters, and tells of it.
+struct Changes {
+    events: Publisher<raw::ParameterEvent>,
+    health: Arc<Health>,
+    clock: Clock,
 }
 
-fn report(parameters: &Parameters, events: &Publisher<raw::ParameterEvent>, changes: Vec<(String, ParameterValue)>) {
-    let changed_parameters =
-        changes.into_iter().map(|(name, value)| raw::Parameter { name, value: value.into() }).collect();
-    let event = raw::ParameterEvent {
-        stamp: builtin_interfaces::Time::now(),
-        node: parameters.node().to_owned(),
-        new_parameters: Vec::new(),
-        changed_parameters,
-        deleted_parameters: Vec::new(),
-    };
-    if events.publish(event).is_err() {
-        log::warn!("the change of a parameter could not be published on /parameter_events");
+impl Changes {
+    fn set(&self, parameters: &Parameters, changes: Vec<raw::Parameter>) -> raw::SetParametersResult {
+        let changes: Vec<(String, ParameterValue)> =
+            changes.into_iter().map(|change| (change.name, change.value.into())).collect();
+        let borrowed: Vec<(&str, &ParameterValue)> =
+            changes.iter().map(|(name, value)| (name.as_str(), value)).collect();
+        match parameters.set_all(&borrowed) {
+            Ok(()) => {
+                self.tell(parameters, |event, values| event.changed_parameters = values, changes);
+                raw::SetParametersResult { successful: true, reason: String::new() }
+            }
+            Err(refusal) => {
+                self.health.refuse("parameter", &refusal.to_string());
+                raw::SetParametersResult { successful: false, reason: refusal.to_string() }
+            }
+        }
+    }
+
+    fn tell(
+        &self,
+        parameters: &Parameters,
+        place: impl FnOnce(&mut raw::ParameterEvent, Vec<raw::Parameter>),
+        values: Vec<(String, ParameterValue)>,
+    ) {
+        let now = self.clock.now();
+        let nanosec = i64::from(now.sec) * 1_000_000_000 + i64::from(now.nanosec);
+        let mut event = raw::ParameterEvent {
+            stamp: builtin_interfaces::Time::from_nanos(nanosec),
+            node: parameters.node().to_owned(),
+            new_parameters: Vec::new(),
+            changed_parameters: Vec::new(),
+            deleted_parameters: Vec::new(),
+        };
+        let values = values.into_iter().map(|(name, value)| raw::Parameter { name, value: value.into() }).collect();
+        place(&mut event, values);
+        if self.events.publish(event).is_err() {
+            self.health.warn("write", "a change of parameters was not written on /parameter_events");
+        }
     }
 }

@@ -7,31 +7,23 @@ use std::cell::RefCell;
 use std::collections::{HashMap, HashSet};
 use std::rc::Rc;
 use std::sync::{Arc, Mutex, PoisonError};
-use std::time::Duration;
 
 use futures::channel::{mpsc, oneshot};
 use futures::{SinkExt, StreamExt};
 use jigsaw_msgs::builtin_interfaces::msg::Time;
 use jigsaw_msgs::{Message, Service};
-use ros2_client::{Context, MessageTypeName, Name, Node, ServiceMapping, ServiceTypeName};
+use ros2_client::{Context, MessageTypeName, Name, Node};
 use rustdds::GUID;
-use serde::{Deserialize, Serialize};
 
 use super::args::{ArgsError, NodeNames};
 use super::health::Health;
+use super::lifecycle::Activity;
 use super::params::Parameters;
-use super::topics::{SERVICE_QOS, Topic};
+use super::topics::Topic;
 
 /// Messages that may wait between the middleware and a node's loop. Few: what waits further out waits in the
 /// middleware's cache, whose depth is the topic's.
 pub const CHANNEL_DEPTH: usize = 4;
-
-/// How long the first answer to a client waits. A request may come before the middleware has met the client's reader
-/// of answers, and an answer that is written then is lost; on loopback they meet within about 0.1 s.
-const INTRODUCTION: Duration = Duration::from_millis(150);
-
-/// Clients remembered as met; beyond, memory is bounded by forgetting them, which costs each another introduction.
-const MOST_CLIENTS: usize = 1024;
 
 /// Why a node could not be opened.
 #[derive(Debug, thiserror::Error)]
@@ -64,13 +56,6 @@ pub struct Call<S: Service> {
     /// Where the answer goes; a call that is dropped is never answered.
     pub reply: oneshot::Sender<S::Response>,
 }
-
-/// Gives a message of a service the client library's marker trait; same bytes.
-#[derive(Debug, Clone, Serialize, Deserialize)]
-#[serde(transparent, bound = "")]
-pub(super) struct Wire<T: Message>(pub(super) T);
-
-impl<T: Message> ros2_client::Message for Wire<T> {}
 
 /// What discovery has told of the endpoints of this process.
 #[derive(Debug, Clone, Default)]
@@ -166,6 +151,8 @@ pub struct Session {
     pub health: Arc<Health>,
     /// The time.
     pub clock: Clock,
+    /// Whether the node works now; see [`Self::manage`].
+    pub activity: Activity,
 }
 
 impl Session {
@@ -239,56 +226,8 @@ impl Session {
     /// As for [`Self::subscribe`].
     pub fn serve<S: Service + 'static>(&mut self, service: &str) -> Result<mpsc::Receiver<Call<S>>, SessionError> {
         let name = self.names.service(service)?;
-        let server = self
-            .node
-            .create_server::<Wire<S::Request>, Wire<S::Response>>(
-                ServiceMapping::Enhanced,
-                &dds_name(&name)?,
-                &ServiceTypeName::new(S::PACKAGE, S::NAME),
-                SERVICE_QOS,
-                SERVICE_QOS,
-            )
-            .map_err(|e| SessionError::middleware(format!("service {name}"), e))?;
-        let server = Rc::new(server);
-        let (mut sender, receiver) = mpsc::channel(CHANNEL_DEPTH);
-        let health = Arc::clone(&self.health);
-        let executor = Rc::clone(&self.executor);
-        self.spawn(async move {
-            let mut requests = server.receive_request_stream();
-            let mut clients = HashSet::new();
-            while let Some(request) = requests.next().await {
-                let (id, request) = match request {
-                    Ok((id, Wire(request))) => (id, request),
-                    Err(e) => {
-                        health.refuse("undecodable", &format!("request of {name} can't be decoded: {e}"));
-                        continue;
-                    }
-                };
-                let (reply, answer) = oneshot::channel();
-                if sender.send(Call { request, reply }).await.is_err() {
-                    break;
-                }
-                let (server, health, name) = (Rc::clone(&server), Arc::clone(&health), name.clone());
-                if clients.len() >= MOST_CLIENTS {
-                    clients.clear();
-                }
-                let introduction = clients.insert(id.writer_gid).then(|| smol::Timer::after(INTRODUCTION));
-                executor
-                    .spawn(async move {
-                        let answer = answer.await;
-                        if let Some(introduction) = introduction {
-                            introduction.await;
-                        }
-                        if let Ok(answer) = answer
-                            && let Err(e) = server.async_send_response(id, Wire(answer)).await
-                        {
-                            health.warn("write", &format!("the answer of {name} was not written: {e}"));
-                        }
-                    })
-                    .detach();
-            }
-        });
-        Ok(receiver)
+        let types = [S::Request::TYPE.dds_name, S::Response::TYPE.dds_name].map(str::to_owned);
+        self.open_server(&name, types, |request, reply| Call { request, reply })
     }
 
     /// Who listens to a writer that was opened beside the publishers of this session.

@@ -4,6 +4,7 @@ use std::marker::PhantomData;
 use std::time::Duration;
 
 use jigsaw_msgs::diagnostic_msgs::msg::DiagnosticArray;
+use jigsaw_msgs::lifecycle_msgs::msg::TransitionEvent;
 use jigsaw_msgs::msg::{Assembly, PieceFeatures, PieceImage};
 use jigsaw_msgs::rosgraph_msgs::msg::Clock;
 use jigsaw_msgs::sensor_msgs::msg::{CompressedImage, Image};
@@ -79,6 +80,10 @@ pub const TF_STATIC: Topic<TFMessage> = Topic::new("/tf_static", LATCHED);
 /// State of the nodes.
 pub const DIAGNOSTICS: Topic<DiagnosticArray> =
     Topic::new("/diagnostics", RELIABLE.history(History::KeepLast { depth: 10 }));
+
+/// Steps of the lifecycle of a node.
+pub const TRANSITION_EVENT: Topic<TransitionEvent> =
+    Topic::new("~/transition_event", RELIABLE.history(History::KeepLast { depth: 10 }));
 
 /// Simulated time.
 pub const CLOCK: Topic<Clock> = Topic::new("/clock", QosProfile::subscription_default());

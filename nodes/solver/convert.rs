@@ -8,10 +8,12 @@ use isthmus::contour::Border;
 use isthmus::isthmus::{Isthmus, Polarity};
 use isthmus::{Features, Point};
 use jigsaw::{Assembly, Piece};
+use jigsaw_msgs::action::AssembleGoal;
 use jigsaw_msgs::builtin_interfaces::msg::Time;
 use jigsaw_msgs::geometry_msgs::msg::{Point as PointMessage, Pose, Transform, TransformStamped, Vector3};
 use jigsaw_msgs::msg::{
     Assembly as AssemblyMessage, CandidateCounts, Isthmus as IsthmusMessage, Mating, PieceFeatures, PiecePose,
+    SkeletonBranch,
 };
 use jigsaw_msgs::sensor_msgs::msg::Image;
 use jigsaw_msgs::std_msgs::msg::{ColorRGBA, Header};
@@ -19,13 +21,20 @@ use jigsaw_msgs::tf2_msgs::msg::TFMessage;
 use jigsaw_msgs::visualization_msgs::msg::{Marker, MarkerArray};
 use nalgebra::{Isometry2, Point2};
 
-use crate::capture::convert::MAX_SIDE_PX;
-use crate::feature::convert::{MAX_ID_LENGTH, image_message, is_piece_id};
+use crate::capture::convert::{MAX_SIDE_PX, header_fault, shown, text_fault};
+use crate::feature::convert::{MAX_ID_LENGTH, SCALE_RULE, SCALES, image_message, is_piece_id};
 use crate::picture::{self, AssemblyStyle};
 use crate::ros::transforms::{PixelPlane, pose_message};
 
-/// Most points of a border: a piece as large as the largest frame, sampled at every pixel of its circumference.
-const MAX_BORDER_POINTS: usize = 4 * MAX_SIDE_PX as usize;
+/// Most points of a border: a piece of some 8000 pixels, sampled at every pixel of its circumference.
+const MAX_BORDER_POINTS: usize = MAX_SIDE_PX as usize;
+
+/// Most border points of all pieces together, so that memory stays bounded: four times those of a thousand pieces of
+/// 1000 pixels.
+pub const MAX_POINTS_KEPT: usize = 16_000_000;
+
+/// Most samples of an isthmus distance function, and most branches of a skeleton.
+const MAX_SAMPLES: usize = 4096;
 
 /// Most isthmuses of a piece. Real pieces have about ten.
 const MAX_ISTHMUSES: usize = 1000;
@@ -66,6 +75,16 @@ pub enum FeaturesError {
         /// The parameter.
         most: usize,
     },
+    /// As much as memory is set aside for.
+    #[error(
+        "piece '{id}': {points} border points would be kept: must be at most {MAX_POINTS_KEPT} of all pieces together"
+    )]
+    Points {
+        /// Piece.
+        id: String,
+        /// Those of all pieces with it.
+        points: usize,
+    },
     /// The solver does not take it.
     #[error("piece refused by the solver: {0}")]
     Solver(String),
@@ -79,29 +98,36 @@ impl FeaturesError {
             Self::DuplicateId(_) => "duplicate_id",
             Self::Field { field, .. } => field,
             Self::Full { .. } => "maximum_pieces",
+            Self::Points { .. } => "border_points",
             Self::Solver(_) => "solver",
         }
     }
 }
 
-/// The goal of the action `assemble`; its fields are those of `jigsaw_msgs/action/Assemble_Goal` in their order.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, serde::Serialize, serde::Deserialize)]
-pub struct AssembleGoal {
-    /// Pieces of the whole puzzle; 0 for as many as come.
-    pub expected_pieces: u32,
-    /// Seconds of the time budget; 0 (with no nanoseconds) for no limit.
-    pub budget_sec: i32,
-    /// Nanoseconds of the time budget.
-    pub budget_nanosec: u32,
+/// Why a goal of `assemble` is rejected.
+#[derive(Debug, Clone, PartialEq, thiserror::Error)]
+#[non_exhaustive]
+pub enum GoalError {
+    /// A time that is none.
+    #[error("time_budget is {sec} s and {nanosec} ns: must be 0 s or more, and less than 1000000000 ns")]
+    Budget {
+        /// Seconds.
+        sec: i32,
+        /// Nanoseconds.
+        nanosec: u32,
+    },
 }
 
-impl ros2_client::Message for AssembleGoal {}
-
-impl AssembleGoal {
-    /// The time there is, if it is limited.
-    pub fn budget(&self) -> Option<Duration> {
-        let budget = Duration::new(u64::try_from(self.budget_sec).unwrap_or_default(), self.budget_nanosec);
-        (!budget.is_zero()).then_some(budget)
+/// The time that a goal of `assemble` gives, if it is limited.
+///
+/// # Errors
+/// A time that is none.
+pub fn budget(goal: &AssembleGoal) -> Result<Option<Duration>, GoalError> {
+    const NANOS: u32 = 1_000_000_000;
+    let (sec, nanosec) = (goal.time_budget.sec, goal.time_budget.nanosec);
+    match u64::try_from(sec) {
+        Ok(whole) if nanosec < NANOS => Ok(Some(Duration::new(whole, nanosec)).filter(|budget| !budget.is_zero())),
+        _ => Err(GoalError::Budget { sec, nanosec }),
     }
 }
 
@@ -147,7 +173,11 @@ impl Sighting {
 pub fn piece(message: &PieceFeatures) -> Result<(Piece, Sighting), FeaturesError> {
     let id = &message.id;
     if !is_piece_id(id) {
-        return Err(FeaturesError::Id(id.chars().take(MAX_ID_LENGTH).collect()));
+        return Err(FeaturesError::Id(shown(id)));
+    }
+    if let Some((field, value, rule)) = header_fault(&message.header).or_else(|| text_fault("source", &message.source))
+    {
+        return Err(FeaturesError::Field { id: id.clone(), field, value, rule: rule.to_owned() });
     }
     let check = |field: &'static str, holds: bool, value: &dyn ToString, rule: &dyn ToString| {
         if holds {
@@ -159,7 +189,12 @@ pub fn piece(message: &PieceFeatures) -> Result<(Piece, Sighting), FeaturesError
     check("frame_width_px", sides.contains(&message.frame_width_px), &message.frame_width_px, &"1 to 32768")?;
     check("frame_height_px", sides.contains(&message.frame_height_px), &message.frame_height_px, &"1 to 32768")?;
     let scale = message.metres_per_pixel;
-    check("metres_per_pixel", scale.is_finite() && scale > 0.0, &scale, &"a positive number")?;
+    check("metres_per_pixel", SCALES.contains(&scale), &scale, &SCALE_RULE)?;
+    let side = -(MAX_SIDE_PX as i32)..=MAX_SIDE_PX as i32;
+    check("aoi_x_px", side.contains(&message.aoi_x_px), &message.aoi_x_px, &"-32768 to 32768")?;
+    check("aoi_y_px", side.contains(&message.aoi_y_px), &message.aoi_y_px, &"-32768 to 32768")?;
+    check("aoi_width_px", sides.contains(&message.aoi_width_px), &message.aoi_width_px, &"1 to 32768")?;
+    check("aoi_height_px", sides.contains(&message.aoi_height_px), &message.aoi_height_px, &"1 to 32768")?;
     check("noise_px", (0.0..=1e3).contains(&message.noise_px), &message.noise_px, &"0 to 1000")?;
     let (xs, ys) = (&message.border_x_px, &message.border_y_px);
     check("border_y_px length", xs.len() == ys.len(), &ys.len(), &format!("that of border_x_px, {}", xs.len()))?;
@@ -186,6 +221,8 @@ pub fn piece(message: &PieceFeatures) -> Result<(Piece, Sighting), FeaturesError
     for isthmus in &message.isthmuses {
         check_isthmus(isthmus, told, &check)?;
     }
+    check_skeleton(["endoskeleton", "endoskeleton points"], &message.endoskeleton, &check)?;
+    check_skeleton(["exoskeleton", "exoskeleton points"], &message.exoskeleton, &check)?;
 
     let centroid_in_image = Point::from(moment / (3.0 * twice_area));
     let spacing = length / points.len() as f64;
@@ -232,7 +269,40 @@ fn check_isthmus(isthmus: &IsthmusMessage, border_length: f64, check: &Check<'_>
     check("isthmuses.path_length_px", on_border, &path, &format!("up to the border's length, {border_length:.1}"))?;
     let persistence = isthmus.persistence_px;
     // Infinite where no end of the branch is narrower.
-    check("isthmuses.persistence_px", persistence >= 0.0, &persistence, &"0 or more")
+    check("isthmuses.persistence_px", persistence >= 0.0, &persistence, &"0 or more")?;
+    let idf = &isthmus.idf_px;
+    check("isthmuses.idf_px length", idf.len() <= MAX_SAMPLES, &idf.len(), &MAX_SAMPLES)?;
+    let bad = idf.iter().find(|d| !(0.0..=reach).contains(*d));
+    check("isthmuses.idf_px", bad.is_none(), &bad.copied().unwrap_or_default(), &"0 to 65536")
+}
+
+/// Matching needs no skeleton, but whoever records or draws the message relies on it.
+fn check_skeleton(
+    [field, points]: [&'static str; 2],
+    branches: &[SkeletonBranch],
+    check: &Check<'_>,
+) -> Result<(), FeaturesError> {
+    check(
+        field,
+        branches.len() <= MAX_SAMPLES,
+        &format!("{} branches", branches.len()),
+        &format!("at most {MAX_SAMPLES}"),
+    )?;
+    let reach = 2.0 * MAX_SIDE_PX as f32;
+    for branch in branches {
+        let lengths = [branch.x_px.len(), branch.y_px.len(), branch.distance_px.len()];
+        let fits = lengths[0] <= MAX_BORDER_POINTS && lengths.iter().all(|length| *length == lengths[0]);
+        check(
+            points,
+            fits,
+            &format!("{lengths:?} long"),
+            &format!("three times the same, at most {MAX_BORDER_POINTS}"),
+        )?;
+        let values = branch.x_px.iter().chain(&branch.y_px).chain(&branch.distance_px);
+        let bad = values.copied().find(|v| !(-reach..=reach).contains(v));
+        check(points, bad.is_none(), &bad.unwrap_or_default(), &"-65536 to 65536")?;
+    }
+    Ok(())
 }
 
 fn isthmus(message: &IsthmusMessage) -> Isthmus {

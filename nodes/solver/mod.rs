@@ -21,8 +21,10 @@ use jigsaw_msgs::std_srvs::srv::{Trigger, TriggerResponse};
 use jigsaw_msgs::tf2_msgs::msg::TFMessage;
 use jigsaw_msgs::visualization_msgs::msg::MarkerArray;
 
+use crate::capture::inactive;
 use crate::ros::actions::{Goal, GoalEnd};
 use crate::ros::health::Health;
+use crate::ros::lifecycle::{Activity, Forget, WhileInactive};
 use crate::ros::params::Parameters;
 use crate::ros::process::{ProcessError, Program, Work};
 use crate::ros::session::{Call, Session};
@@ -42,7 +44,7 @@ pub const PROGRAM: Program = Program {
 };
 
 /// A goal of the action `assemble`.
-pub type AssembleGoal = Goal<convert::AssembleGoal, Assemble>;
+pub type AssembleGoal = Goal<Assemble>;
 
 /// Where the results go.
 #[derive(Debug, Clone)]
@@ -102,7 +104,11 @@ pub fn open(
     let solves = session.serve::<Trigger>(topics::SOLVE_SERVICE)?;
     // Drawing never holds up solving.
     let (to_draw, solutions) = mpsc::unbounded();
-    let goals = session.act::<Assemble, convert::AssembleGoal>(topics::ASSEMBLE_ACTION)?;
+    let activity = session.activity.clone();
+    let goals = session.act::<Assemble>(topics::ASSEMBLE_ACTION, move |goal| {
+        convert::budget(goal).map_err(|e| e.to_string())?;
+        if activity.is_active() { Ok(()) } else { Err("the node is not active".to_owned()) }
+    })?;
     let outputs = Outputs {
         assembly: session.publish(&topics::ASSEMBLY)?.0,
         transforms: session.publish(&topics::TF_STATIC)?.0,
@@ -111,9 +117,15 @@ pub fn open(
     };
     let (images, audience) = session.publish(&topics::ASSEMBLY_IMAGE)?;
     session.spawn(draw(solutions, images, move || audience.count() > 0));
-    let (parameters, health) = (Arc::clone(&session.parameters), Arc::clone(&session.health));
+    let settings = Settings {
+        parameters: Arc::clone(&session.parameters),
+        health: Arc::clone(&session.health),
+        activity: session.activity.clone(),
+    };
+    let features = session.activity.gate(features, WhileInactive::Hold);
+    let forgets = session.manage(|| Ok(()))?;
     Ok(Box::pin(async move {
-        run(features, Requests { resets, solves, goals }, outputs, parameters, health).await;
+        run(features, Requests { resets, solves, goals, forgets }, outputs, settings).await;
         drop(session);
         Ok(())
     }))
@@ -121,13 +133,26 @@ pub fn open(
 
 /// What others may ask for.
 #[derive(Debug)]
-pub struct Requests<R, S, G> {
+pub struct Requests<R, S, G, F> {
     /// Calls of `reset`.
     pub resets: R,
     /// Calls of `solve`.
     pub solves: S,
     /// Goals of `assemble`, one at a time.
     pub goals: G,
+    /// Wishes to forget all pieces.
+    pub forgets: F,
+}
+
+/// What the loop needs beside its streams.
+#[derive(Debug, Clone)]
+pub struct Settings {
+    /// Parameters, looked at with every solution.
+    pub parameters: Arc<Parameters>,
+    /// Counters.
+    pub health: Arc<Health>,
+    /// Whether the node works.
+    pub activity: Activity,
 }
 
 /// The node's loop. Ends, after a last solution, when shapes and requests have ended.
@@ -137,31 +162,35 @@ pub async fn run(
         impl Stream<Item = Call<Trigger>> + Unpin,
         impl Stream<Item = Call<Trigger>> + Unpin,
         impl Stream<Item = AssembleGoal> + Unpin,
+        impl Stream<Item = Forget> + Unpin,
     >,
     outputs: Outputs,
-    parameters: Arc<Parameters>,
-    health: Arc<Health>,
+    settings: Settings,
 ) {
-    let mut changes = parameters.changes();
-    let mut table = Table::new(outputs, parameters, health);
+    let mut changes = settings.parameters.changes();
+    let mut switches = settings.activity.changes();
+    let mut table = Table::new(outputs, settings);
     let mut features = features.fuse();
     let (mut resets, mut solves, mut goals) = (requests.resets.fuse(), requests.solves.fuse(), requests.goals.fuse());
+    let mut forgets = requests.forgets.fuse();
     let solving = Fuse::terminated();
     let cancelled = Fuse::terminated();
     pin_mut!(solving, cancelled);
     loop {
         let idle = solving.is_terminated();
-        let ended = features.is_done() && resets.is_done() && solves.is_done() && goals.is_done();
+        let asked = resets.is_done() && solves.is_done() && goals.is_done() && forgets.is_done();
+        let ended = features.is_done() && asked;
         if idle && ended && table.due.is_none() {
             break;
         }
         let now = Instant::now();
         table.end_overdue_goal(now);
-        if idle && table.due.is_some_and(|due| due <= now) {
+        let ready = idle && table.activity.is_active();
+        if ready && table.due.is_some_and(|due| due <= now) {
             solving.set(smol::unblock(table.work()).fuse());
             continue;
         }
-        let next = table.due.filter(|_| idle).into_iter().chain(table.deadline()).min();
+        let next = table.due.filter(|_| ready).into_iter().chain(table.deadline()).min();
         let mut alarm = FutureExt::fuse(next.map_or_else(smol::Timer::never, smol::Timer::at));
         futures::select! {
             message = features.next() => if let Some(message) = message {
@@ -170,13 +199,31 @@ pub async fn run(
             _ = alarm => {}
             done = solving => table.publish(done).await,
             call = resets.next() => if let Some(call) = call {
-                table.reset();
-                table.publish_empty().await;
-                answer(call, true, "all pieces are forgotten".to_owned());
+                if table.activity.is_active() {
+                    table.reset();
+                    table.publish_empty().await;
+                    answer(call, TriggerResponse { success: true, message: "all pieces are forgotten".to_owned() });
+                } else {
+                    answer(call, inactive());
+                }
             },
             call = solves.next() => if let Some(call) = call {
-                table.waiting.push(call);
-                table.due = Some(Instant::now());
+                if table.activity.is_active() {
+                    table.waiting.push(call);
+                    table.due = Some(Instant::now());
+                } else {
+                    answer(call, inactive());
+                }
+            },
+            forget = forgets.next() => if let Some(forget) = forget {
+                table.reset();
+                // What is latched must not speak of pieces that are forgotten.
+                table.publish_empty().await;
+                let _ = forget.send(());
+            },
+            _ = switches.next() => if !table.activity.is_active() {
+                table.end_goal(GoalEnd::Aborted);
+                table.waiting.drain(..).for_each(|call| answer(call, inactive()));
             },
             goal = goals.next() => if let Some(goal) = goal {
                 cancelled.set(table.pursue(goal).fuse());
@@ -191,9 +238,9 @@ pub async fn run(
     }
 }
 
-fn answer(call: Call<Trigger>, success: bool, message: String) {
+fn answer(call: Call<Trigger>, response: TriggerResponse) {
     // The caller may have gone; that is no concern of the node.
-    let _ = call.reply.send(TriggerResponse { success, message });
+    let _ = call.reply.send(response);
 }
 
 /// What one run of the worker gives back.
@@ -222,6 +269,7 @@ struct Table {
     outputs: Outputs,
     parameters: Arc<Parameters>,
     health: Arc<Health>,
+    activity: Activity,
     /// None at first, after a reset, and while the worker has it.
     solver: Option<Solver>,
     /// Pieces that the solver does not have yet.
@@ -251,11 +299,13 @@ struct Pursuit {
 }
 
 impl Table {
-    fn new(outputs: Outputs, parameters: Arc<Parameters>, health: Arc<Health>) -> Self {
+    fn new(outputs: Outputs, settings: Settings) -> Self {
+        let Settings { parameters, health, activity } = settings;
         Self {
             outputs,
             parameters,
             health,
+            activity,
             solver: None,
             incoming: Vec::new(),
             sightings: HashMap::new(),
@@ -273,7 +323,8 @@ impl Table {
         let now = Instant::now();
         self.goal = Some(Pursuit {
             expected_pieces: usize::try_from(goal.goal.expected_pieces).unwrap_or(usize::MAX),
-            deadline: goal.goal.budget().and_then(|budget| now.checked_add(budget)),
+            // One that breaks the rules was rejected already.
+            deadline: convert::budget(&goal.goal).ok().flatten().and_then(|budget| now.checked_add(budget)),
             feedback: goal.feedback,
             finish: goal.finish,
         });
@@ -332,6 +383,11 @@ impl Table {
         if self.sightings.len() >= most {
             return Err(FeaturesError::Full { id: piece.id, most });
         }
+        let kept: usize = self.sightings.values().map(|(_, other)| other.border_in_image.len()).sum();
+        let points = kept + sighting.border_in_image.len();
+        if points > convert::MAX_POINTS_KEPT {
+            return Err(FeaturesError::Points { id: piece.id, points });
+        }
         self.sightings.insert(piece.id.clone(), (fingerprint, sighting));
         self.incoming.push(piece);
         Ok(true)
@@ -381,6 +437,11 @@ impl Table {
         let pieces = done.solver.as_ref().map(|solver| solver.pieces().to_vec()).unwrap_or_default();
         let sightings = pieces.iter().filter_map(|p| self.sightings.get(&p.id).map(|(_, s)| s.clone())).collect();
         self.solver = done.solver;
+        if !self.activity.is_active() {
+            // The node was told to stop while it solved; it solves again when it is told to go on.
+            self.due = Some(Instant::now());
+            return;
+        }
         self.health.figure("solve_seconds", format!("{:.4}", done.seconds));
         self.send(Solution { pieces, sightings, assembly: done.assembly, naming: self.naming() }).await;
     }
@@ -444,7 +505,7 @@ impl Table {
         let _ = self.outputs.markers.send(solution.markers_message()).await;
         let _ = self.outputs.solutions.unbounded_send(Arc::new(solution));
         for call in self.waiting.drain(..) {
-            answer(call, true, summary.clone());
+            answer(call, TriggerResponse { success: true, message: summary.clone() });
         }
     }
 

@@ -31,7 +31,6 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.qos import QoSDurabilityPolicy, QoSProfile, QoSReliabilityPolicy
 
 EVENT_TIMEOUT = 30.0  # seconds until an awaited event counts as missing; on an idle machine all come within 2
-ANSWER_PATIENCE = 5.0  # seconds until a call is made again; a request that is sent again by DDS itself takes 3
 EXIT_TIMEOUT = 10.0  # seconds that a process may take to end after SIGTERM
 
 LATCHED = QoSProfile(depth=1, reliability=QoSReliabilityPolicy.RELIABLE, durability=QoSDurabilityPolicy.TRANSIENT_LOCAL)
@@ -197,23 +196,21 @@ class Harness:
             self.executor.spin_once(timeout_sec=0.05)
         return result
 
+    def adopt(self, node):
+        """Spins a node that was made elsewhere, in this context."""
+        self.nodes.append(node)
+        self.executor.add_node(node)
+        return node
+
     def call(self, client, request, timeout=EVENT_TIMEOUT):
-        """Calls a service and gives its answer.
-
-        Right after discovery a server may not know yet where answers go, and the first one is lost; so the call is made
-        again. Every service called here may be called twice.
-        """
+        """Calls a service as soon as it is there, once, and gives its answer (after 3 s where discovery is not through)."""
         self.until(client.service_is_ready, f"service {client.srv_name}", timeout)
-        futures = []
+        return self.result(client.call_async(request), f"answer of {client.srv_name}", timeout)
 
-        def answered():
-            return next((future for future in futures if future.done()), None)
-
-        for last in (False, False, True):
-            futures.append(client.call_async(request))
-            what = f"answer of {client.srv_name}"
-            if future := self.until(answered, what, timeout if last else ANSWER_PATIENCE, required=last):
-                return future.result()
+    def result(self, future, what, timeout=EVENT_TIMEOUT):
+        """Waits for a future and gives what came of it."""
+        self.until(future.done, what, timeout)
+        return future.result()
 
     def latest(self, node, message_type, topic, qos=LATCHED):
         """Subscribes; the returned list always holds what came."""
