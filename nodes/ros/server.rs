@@ -140,11 +140,15 @@ impl<Req: DeserializeOwned + 'static, Resp: Serialize + 'static> Server<Req, Res
     }
 
     async fn send(&self, request: RmwRequestId, answer: Resp) {
-        let options = WriteOptionsBuilder::new()
+        let mut options = WriteOptionsBuilder::new()
             .source_timestamp(Timestamp::now())
-            .related_sample_identity(SampleIdentity::from(request))
-            .build();
-        if let Err(e) = self.answers.async_write_with_options(answer, options).await {
+            .related_sample_identity(SampleIdentity::from(request));
+        let client = GUID::from(request.writer_gid);
+        if client.entity_id.kind().is_reader() {
+            // The answers to others would crowd those to it out of its queue, which holds ten.
+            options = options.to_single_reader(client);
+        }
+        if let Err(e) = self.answers.async_write_with_options(answer, options.build()).await {
             self.health.warn("write", &format!("the answer of {} was not written: {}", self.name, e.forget_data()));
         }
     }

@@ -100,8 +100,8 @@ pub const SOLVE_SERVICE: &str = "solve";
 /// Action of the solver node: assemble until the puzzle is complete or the time is up.
 pub const ASSEMBLE_ACTION: &str = "assemble";
 
-/// Quality of service of both ends of all services.
-pub const SERVICE_QOS: QosProfile = RELIABLE.history(History::KeepLast { depth: 10 });
+/// Quality of service of both ends of all services: ten times the usual depth, so that a burst of calls loses none.
+pub const SERVICE_QOS: QosProfile = RELIABLE.history(History::KeepLast { depth: 100 });
 
 /// Quality of service of the feedback of actions.
 pub const FEEDBACK_QOS: QosProfile = RELIABLE.history(History::KeepLast { depth: 10 });

@@ -1,5 +1,5 @@
-"""Managed nodes: driven through their lifecycle as `ros2 lifecycle` and a lifecycle manager do, beside a lifecycle node of
-rclpy, which has its states and transitions from rcl_lifecycle itself."""
+"""Managed nodes: driven through their lifecycle as `ros2 lifecycle` and a lifecycle manager do, beside a lifecycle node
+of rclpy, which has its states and transitions from rcl_lifecycle itself."""
 
 import numpy
 import pytest
@@ -56,6 +56,15 @@ class Managed:
     def change(self, transition):
         return self.call(ChangeState, "change_state", transition=transition).success
 
+    def await_events(self):
+        topic = f"/{self.name}/transition_event"
+        self.ros.until(lambda: self.node.count_publishers(topic), f"publisher of {topic}")
+
+    def services(self):
+        """The services that the graph knows as those of the node, with their types."""
+        find = self.node.get_service_names_and_types_by_node
+        return self.ros.until(lambda: dict(find(self.name, "/")), f"services of {self.name}")
+
     def to(self, *labels):
         for label in labels:
             assert self.change(Transition(label=label)), f"{self.name}: {label}"
@@ -82,7 +91,7 @@ def test_states_and_transitions_are_those_of_rcl(launcher, ros, name):
     assert ours.graph() == oracle.graph()
     assert ours.state() == oracle.state() == State(id=State.PRIMARY_STATE_UNCONFIGURED, label="unconfigured")
     for node in (ours, oracle):
-        ros.until(lambda: node.node.count_publishers(f"/{node.name}/transition_event"), "publisher of events")
+        node.await_events()
     for transition in JOURNEY:
         assert ours.change(transition) == oracle.change(transition), transition
         assert ours.state() == oracle.state(), transition
@@ -102,9 +111,7 @@ def test_a_plain_start_is_active_and_is_found_as_a_managed_node(launcher, ros):
         managed = Managed(ros, name)
         assert managed.state().label == "active"
         # `ros2 lifecycle nodes` takes for a managed node what has this service.
-        services = ros.until(
-            lambda: dict(managed.node.get_service_names_and_types_by_node(name, "/")), "services by node"
-        )
+        services = managed.services()
         assert services[f"/{name}/get_state"] == ["lifecycle_msgs/srv/GetState"]
 
 
