@@ -1,20 +1,18 @@
 //! Sub-pixel border of a shape.
 //!
 //! # Method
-//! 1. *Iso-contour* of the grey picture half-way between the levels of shape and ground, by marching squares with
-//!    linear interpolation (W. E. Lorensen, H. E. Cline, *Marching cubes*, SIGGRAPH 1987, in the plane). A diagonal
-//!    cell joins the shape where its mean lies on the shape's side (G. M. Nielson, B. Hamann, *The asymptotic
+//! 1. *Iso-contour* of the grey picture half-way between the levels of shape and ground, by marching squares (W. E. Lorensen,
+//!    H. E. Cline, *Marching cubes*, SIGGRAPH 1987, in the plane), the levels between pixels running as across a blurred edge. A
+//!    diagonal cell joins the shape where its mean lies on the shape's side (G. M. Nielson, B. Hamann, *The asymptotic
 //!    decider*, Visualization 1991). Of all closed contours the longest outer one is taken.
-//! 2. A picture that is too noisy or too sharp (one-bit, without grey levels at the edge) for linear interpolation is
-//!    blurred first, near the contour: just enough, as the measured noise and edge slope ask for.
+//! 2. A picture that is too noisy or too sharp (one-bit, without grey levels at the edge) for its contour to be trusted is
+//!    blurred first, near the contour: just enough, as the measured noise and edge blur ask for.
 //! 3. *Resampling* at equal steps of about one pixel of arc length.
-//! 4. *Smoothing* by a Gaussian along the border. Its width balances what is left of the measured noise against the
-//!    rounding of the tightest curves: a Gaussian of standard deviation `s` leaves `noise^2 / (2 sqrt(pi) s)` of the
-//!    variance and moves a curve of radius `r` by `s^2 / (2 r)`; the sum of squares is least at
-//!    `s^5 = noise^2 r^2 / (2 sqrt(pi))`.
+//! 4. *Restoration*: blur rounds a border, its curves move towards their centres. One linear filter along the border undoes the
+//!    measured blur as far as the measured noise allows (`restore`).
 //!
-//! The border's noise is measured on the border itself: the fourth difference of its points across the border, a
-//! filter that curves of the shape do not pass (median absolute deviation, so that corners do not count).
+//! The blur is measured across the edge, all along the border; the noise on the border itself: by the fourth difference of its
+//! points across the border, a filter that curves of the shape do not pass (median absolute deviation, so that corners do not count).
 //!
 //! # Cost
 //! One pass over the cutout to find the contours, then linear in the length of the border.
@@ -31,9 +29,12 @@
 //! # Ok::<(), isthmus::contour::ContourError>(())
 //! ```
 
+mod restore;
+
 use crate::Point;
 use crate::mask::Cutout;
 use nalgebra::Vector2;
+use restore::{Filter, History, edge_blur, noise_power};
 
 /// A closed border: the last point joins the first. Points are equally spaced along it and run so that the shoelace
 /// area in (x right, y down) is positive: clockwise as seen on a screen, the outward normal being `(dy, -dx)`.
@@ -126,18 +127,16 @@ pub const MAX_COORDINATE: f64 = 1e8;
 
 /// Spacing of the border's points in pixels: the resolution of the picture, no more, no less.
 const SPACING: f64 = 1.0;
-/// Step of the fourth difference that measures the noise, in points: neighbours share grey levels, every other one
+/// Least step of the fourth difference that measures the noise, in points: neighbours share grey levels, every other one
 /// hardly does.
 const NOISE_STEP: usize = 2;
-/// Standard deviation of the fourth difference (1, -4, 6, -4, 1) of white noise of standard deviation 1.
-const FOURTH_DIFFERENCE: f64 = 8.366_600_265_340_756;
 /// Median absolute deviation of a normal distribution of standard deviation 1.
 const NORMAL_MAD: f64 = 0.674_489_750_196_081_7;
 /// Radius of the tightest curves worth keeping, as a part of the square root of the shape's area: the fillets of a
 /// puzzle piece's tab are about 4 % of its size.
 const TIGHTEST_CURVE: f64 = 0.04;
-/// Least smoothing along the border, in points: takes out the pixel grid's beat in the contour of a clean picture.
-const MIN_SMOOTHING: f64 = 0.7;
+/// Most optical blur that is undone, as a part of the radius of the tightest curves: more has destroyed them.
+const MAX_UNDONE: f64 = 0.6;
 /// A Gaussian kernel ends here, in standard deviations.
 const KERNEL_EXTENT: f64 = 3.0;
 /// Edges narrower than this (standard deviation of the edge's blur, in pixels) alias: linear interpolation errs.
@@ -146,9 +145,11 @@ const MIN_EDGE_BLUR: f64 = 0.6;
 const EDGE_BLUR: f64 = 1.0;
 /// Most noise at which the contour is traced as it is, as a part of the contrast: at half the contrast being eight
 /// standard deviations away, no pixel is on the wrong side by chance and few near the edge are.
-const MAX_NOISE_TO_CONTRAST: f64 = 1.0 / 16.0;
-/// Most blur against noise, in pixels: more would round the shape's own corners.
-const MAX_BLUR: f64 = 2.5;
+const MAX_NOISE: f64 = 1.0 / 16.0;
+/// Most that noise may move the contour's points, in pixels (standard deviation): beyond, the contour turns back on itself.
+const MAX_WOBBLE: f64 = 0.12;
+/// Most blur against noise, in pixels: more would join parts of the border.
+const MAX_BLUR: f64 = 3.0;
 
 impl Border {
     /// Border from an outline given as the corners of a closed polygon (either sense), resampled at about 1 px.
@@ -338,14 +339,8 @@ pub struct Tracer {
     visited: Vec<bool>,
     contour: Vec<Point>,
     longest: Vec<Point>,
-    unrolled: Vec<Point>,
+    filter: Filter,
     deviations: Vec<f64>,
-}
-
-/// What tracing a contour tells beside its points.
-struct Trace {
-    /// Mean slope of the grey levels across the contour, in levels a pixel.
-    slope: f64,
 }
 
 impl Tracer {
@@ -380,24 +375,31 @@ impl Tracer {
         let raw = Raw { pixels, width };
         self.spans.clear();
         raw.spans(level, sense, &mut self.spans);
-        let traced = self.trace_longest(&Raster { picture: raw, width, height, level, sense });
-        let slope = traced.as_ref().map_or(f64::from(contrast), |t| t.slope);
-        let blur = needed_blur(f64::from(contrast), slope, f64::from(cutout.noise_level));
-        let traced = if blur > 0.0 && traced.is_some() {
+        let found = self.trace_longest(&Raster { picture: raw, width, height, level, contrast, sense });
+        let side = if sense > 0.0 { 1.0 } else { -1.0 };
+        let between = |p: Point| side * raw.between(p, height);
+        let mut optical = if found { edge_blur(&self.longest, f64::from(contrast), between) } else { 0.0 };
+        let late = needed_blur(f64::from(contrast), optical, f64::from(cutout.noise_level));
+        let found = if late > 0.0 && found {
             let mut band = std::mem::take(&mut self.band);
             band.mark(&self.longest, width, height);
-            band.blur(pixels, blur, ground_level);
+            band.blur(pixels, late, ground_level);
             self.spans.clear();
             band.spans(&mut self.spans);
             let picture = Blurred { band: &band, raw };
-            let traced = self.trace_longest(&Raster { picture, width, height, level, sense });
+            let found = self.trace_longest(&Raster { picture, width, height, level, contrast, sense });
             self.band = band;
-            traced
+            if found {
+                optical = edge_blur(&self.longest, f64::from(contrast), between);
+            }
+            found
         } else {
-            traced
+            found
         };
         self.padded = padded;
-        traced.ok_or(ContourError::Nothing { level })?;
+        if !found {
+            return Err(ContourError::Nothing { level });
+        }
 
         let offset =
             Vector2::new(f64::from(cutout.window.x) - margin as f64, f64::from(cutout.window.y) - margin as f64);
@@ -406,17 +408,16 @@ impl Tracer {
         }
         let mut border = Border { points: Vec::new(), spacing: SPACING };
         border.resample(&self.longest)?;
-        let noise = self.smooth(&mut border)?;
+        let noise = self.restore(&mut border, optical, late)?;
         Ok((border, noise))
     }
 
     /// Traces all contours that go up through `self.spans` and leaves the longest outer one in `self.longest`.
-    fn trace_longest<P: Picture>(&mut self, raster: &Raster<P>) -> Option<Trace> {
+    fn trace_longest<P: Picture>(&mut self, raster: &Raster<P>) -> bool {
         let (width, height) = (raster.width, raster.height);
         self.visited.clear();
         self.visited.resize(width * height, false);
         self.longest.clear();
-        let mut best = None;
         for span in &self.spans {
             let y = span.y;
             if y == 0 || y + 1 >= height {
@@ -426,54 +427,39 @@ impl Tracer {
             for x in span.start..span.end {
                 let inside = raster.value(x, y) > 0.0;
                 if inside && outside && !self.visited[y * width + x] && x > 0 {
-                    let slope = raster.follow(x, y, &mut self.visited, &mut self.contour);
+                    raster.follow(x, y, &mut self.visited, &mut self.contour);
                     if self.contour.len() > self.longest.len() && shoelace(&self.contour) > 0.0 {
                         std::mem::swap(&mut self.contour, &mut self.longest);
-                        best = Some(Trace { slope });
                     }
                 }
                 outside = !inside;
             }
         }
-        best
+        !self.longest.is_empty()
     }
 
-    /// Smooths a border as much as its noise asks for; gives the standard deviation of the smoothed points.
-    fn smooth(&mut self, border: &mut Border) -> Result<f64, ContourError> {
-        let raw = self.measure_noise(border);
-        let radius = TIGHTEST_CURVE * border.area().sqrt();
-        let kernel_gain = 2.0 * std::f64::consts::PI.sqrt();
-        let sigma = (raw * raw * radius * radius / kernel_gain).powf(0.2).max(MIN_SMOOTHING);
-        let n = border.points.len();
-        let reach = ((KERNEL_EXTENT * sigma).ceil() as usize).min(n / 2);
-        self.unrolled.clear();
-        self.unrolled.extend_from_slice(&border.points[n - reach..]);
-        self.unrolled.extend_from_slice(&border.points);
-        self.unrolled.extend_from_slice(&border.points[..reach]);
-        let mut kernel: Vec<f64> =
-            (0..=2 * reach).map(|i| (-(i as f64 - reach as f64).powi(2) / (2.0 * sigma * sigma)).exp()).collect();
-        let total: f64 = kernel.iter().sum();
-        kernel.iter_mut().for_each(|k| *k /= total);
-        self.contour.clear();
-        self.contour.extend((0..n).map(|i| {
-            let sum = kernel.iter().zip(&self.unrolled[i..]).fold(Vector2::zeros(), |sum, (k, p)| sum + p.coords * *k);
-            Point::from(sum)
-        }));
+    /// Undoes blur and noise of a border; gives the standard deviation of its points that is left.
+    fn restore(&mut self, border: &mut Border, optical_blur: f64, late_blur: f64) -> Result<f64, ContourError> {
+        let late_blur = late_blur / border.spacing;
+        let step = NOISE_STEP.max((2.0 * late_blur).round() as usize);
+        let noise = noise_power(self.fourth_difference(border, step).powi(2), late_blur, step);
+        let size = border.area().sqrt() / border.spacing;
+        let radius = TIGHTEST_CURVE * size;
+        let blur = (optical_blur / border.spacing).min(MAX_UNDONE * radius).hypot(late_blur);
+        let left = self.filter.design(History { blur, late_blur, radius }, noise);
+        self.filter.apply(&border.points, &mut self.contour);
         border.spacing = SPACING;
         border.resample(&self.contour)?;
-        Ok(raw / (kernel_gain * sigma).sqrt())
+        Ok(left.sqrt() * border.spacing)
     }
 
-    /// Standard deviation of the border's points across the border, in pixels.
-    fn measure_noise(&mut self, border: &Border) -> f64 {
+    /// Standard deviation of the fourth differences of a border's points, `step` apart, across the border, in its spacing.
+    fn fourth_difference(&mut self, border: &Border, step: usize) -> f64 {
         let p = &border.points;
         let n = p.len();
-        let at = |i: usize, steps: usize| {
-            let k = i + steps * NOISE_STEP;
-            p[if k < n { k } else { k - n }].coords
-        };
+        let at = |i: usize, steps: usize| p[(i + steps * step) % n].coords;
         self.deviations.clear();
-        self.deviations.extend((0..n).step_by(NOISE_STEP).map(|i| {
+        self.deviations.extend((0..n).step_by(2).map(|i| {
             let tangent = at(i, 4) - at(i, 0);
             let fourth = at(i, 0) + at(i, 4) - (at(i, 1) + at(i, 3)) * 4.0 + at(i, 2) * 6.0;
             let norm = tangent.norm();
@@ -481,7 +467,7 @@ impl Tracer {
         }));
         let middle = self.deviations.len() / 2;
         let (_, median, _) = self.deviations.select_nth_unstable_by(middle, f64::total_cmp);
-        *median / (NORMAL_MAD * FOURTH_DIFFERENCE)
+        *median / NORMAL_MAD / border.spacing
     }
 }
 
@@ -510,15 +496,22 @@ fn pad(cutout: &Cutout, level: f32, padded: &mut Vec<u8>) -> usize {
 }
 
 /// Blur in pixels that a picture needs before its contour can be trusted.
-fn needed_blur(contrast: f64, slope: f64, noise: f64) -> f64 {
-    let edge_blur = contrast / ((2.0 * std::f64::consts::PI).sqrt() * slope.max(f64::MIN_POSITIVE));
-    let against_aliasing =
-        if edge_blur < MIN_EDGE_BLUR { (EDGE_BLUR * EDGE_BLUR - edge_blur * edge_blur).sqrt() } else { 0.0 };
-    let excess = noise / (contrast * MAX_NOISE_TO_CONTRAST);
-    // A Gaussian of standard deviation s leaves 1 / (2 sqrt(pi) s) of the standard deviation of white noise.
-    let against_noise = if excess > 1.0 { excess / (2.0 * std::f64::consts::PI.sqrt()) } else { 0.0 };
-    // Noise makes edges look sharper than they are; where it is blurred away, there is no aliasing left to fear.
-    if against_noise > 0.0 { against_noise.clamp(MIN_EDGE_BLUR, MAX_BLUR) } else { against_aliasing }
+fn needed_blur(contrast: f64, edge_blur: f64, noise: f64) -> f64 {
+    let noise = noise / contrast;
+    let edge = (2.0 * std::f64::consts::PI).sqrt();
+    if noise > MAX_NOISE || noise * edge * edge_blur > MAX_WOBBLE {
+        // A Gaussian of standard deviation s leaves 1 / (2 sqrt(pi) s) of the standard deviation of white noise, and an edge of
+        // blur b the slope 1 / (sqrt(2 pi) sqrt(b^2 + s^2)): of their quotient, MAX_WOBBLE, follows s.
+        let quotient = noise / (std::f64::consts::SQRT_2 * MAX_WOBBLE);
+        let against_wobble = edge_blur * quotient / (1.0 - quotient * quotient).max(f64::MIN_POSITIVE).sqrt();
+        let against_noise = noise / (MAX_NOISE * 2.0 * std::f64::consts::PI.sqrt());
+        // Noise makes edges look sharper than they are; where it is blurred away, there is no aliasing left to fear.
+        against_wobble.max(against_noise).clamp(MIN_EDGE_BLUR, MAX_BLUR)
+    } else if edge_blur < MIN_EDGE_BLUR {
+        (EDGE_BLUR * EDGE_BLUR - edge_blur * edge_blur).sqrt()
+    } else {
+        0.0
+    }
 }
 
 /// Pixels of one row.
@@ -549,6 +542,17 @@ impl Picture for Raw<'_> {
 }
 
 impl Raw<'_> {
+    /// Grey level between the pixels of a picture of `height` rows, which is continued by its outermost pixels.
+    fn between(&self, p: Point, height: usize) -> f64 {
+        let (x, y) = (p.x.clamp(0.0, (self.width - 1) as f64), p.y.clamp(0.0, (height - 1) as f64));
+        let (i, j) = (x as usize, y as usize);
+        let (u, v) = (x - i as f64, y - j as f64);
+        let (i1, j1) = ((i + 1).min(self.width - 1), (j + 1).min(height - 1));
+        let at = |x: usize, y: usize| f64::from(self.pixels[y * self.width + x]);
+        let (upper, lower) = (at(i, j) + (at(i1, j) - at(i, j)) * u, at(i, j1) + (at(i1, j1) - at(i, j1)) * u);
+        upper + (lower - upper) * v
+    }
+
     /// The stretches of rows in which ground is followed by shape, and a few more.
     fn spans(&self, level: f32, sense: f32, spans: &mut Vec<Span>) {
         /// Pixels that are looked at together: most of a row is uniform.
@@ -719,6 +723,8 @@ struct Raster<P> {
     width: usize,
     height: usize,
     level: f32,
+    /// Difference of the levels of shape and ground.
+    contrast: f32,
     /// 1 for a shape brighter than the ground, -1 for a darker one.
     sense: f32,
 }
@@ -738,14 +744,21 @@ impl<P: Picture> Raster<P> {
         self.sense * (self.picture.at(x, y) - self.level)
     }
 
+    /// How deep within the shape a pixel lies, in units of the edge's blur, from its difference from the level: the inverse of the
+    /// error function, by its series. Between pixels it is linear across an edge, as the grey level is not.
+    fn depth(&self, value: f32) -> f32 {
+        let part = (value / self.contrast).clamp(-0.5, 0.5);
+        let square = part * part;
+        part * (1.0 + square * (std::f32::consts::FRAC_PI_3 + square * 2.303))
+    }
+
     /// Follows the contour that runs up between the pixels `(x - 1, y)` (ground) and `(x, y)` (shape), the shape on its
-    /// right-hand side. Marks the shape pixels to the right of its upward steps. Gives the mean slope of the levels.
-    fn follow(&self, x: usize, y: usize, visited: &mut [bool], contour: &mut Vec<Point>) -> f64 {
+    /// right-hand side. Marks the shape pixels to the right of its upward steps.
+    fn follow(&self, x: usize, y: usize, visited: &mut [bool], contour: &mut Vec<Point>) {
         contour.clear();
         let value = |x: usize, y: usize| self.value(x, y);
         let (start_x, start_y) = (x - 1, y - 1);
         let (mut x, mut y, mut entry) = (start_x, start_y, Side::Bottom);
-        let mut slopes = 0.0;
         loop {
             let (a, b, c, d) = (value(x, y), value(x + 1, y), value(x + 1, y + 1), value(x, y + 1));
             let corners = u8::from(a > 0.0) | u8::from(b > 0.0) << 1 | u8::from(c > 0.0) << 2 | u8::from(d > 0.0) << 3;
@@ -760,10 +773,11 @@ impl<P: Picture> Raster<P> {
                 _ if (entry == Side::Left) == joined() => Side::Top,
                 _ => Side::Bottom,
             };
-            let (gx, gy) = (b - a + c - d, d - a + c - b);
-            slopes += f64::from((gx * gx + gy * gy).sqrt() / 2.0);
             let (fx, fy) = (x as f64, y as f64);
-            let between = |p: f32, q: f32| f64::from(p / (p - q));
+            let between = |p: f32, q: f32| {
+                let (p, q) = (self.depth(p), self.depth(q));
+                f64::from(p / (p - q))
+            };
             contour.push(match exit {
                 Side::Top => Point::new(fx + between(a, b), fy),
                 Side::Right => Point::new(fx + 1.0, fy + between(b, c)),
@@ -780,7 +794,7 @@ impl<P: Picture> Raster<P> {
                 Side::Left => (x - 1, y, Side::Right),
             };
             if (x, y) == (start_x, start_y) && entry == Side::Bottom {
-                return slopes / contour.len() as f64;
+                return;
             }
         }
     }

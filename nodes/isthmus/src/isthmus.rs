@@ -12,8 +12,8 @@
 //!    smaller largest disc ends there; by how much that disc is wider than the edge is the persistence of the isthmus. The
 //!    minima that noise and sampling make along a neck with parallel sides have next to none, and one of them
 //!    stays, the deepest. What lies outside the convex hull counts as one infinitely wide disc.
-//! 3. The chord slides along the border to its shortest, and a quadratic through the squared lengths round it gives both
-//!    ends to a fraction of a step.
+//! 3. The chord slides along the border to its shortest, and Newton's method moves its ends on to where it meets the border,
+//!    taken for a smooth curve, at right angles.
 //!
 //! # Cost
 //! `O(n log n)` in the number of border points; the refinement is constant for each isthmus.
@@ -79,12 +79,14 @@ const SALIENT_MOUTH_AREA: f64 = 0.2;
 const SLIDE: isize = 3;
 /// Most slides of a chord: far more than a neck is long compared with [`SLIDE`]; guards against pathological borders.
 const MAX_SLIDES: usize = 10_000;
-/// Reach of the quadratic fit round the shortest chord, in steps, on a border without noise.
-const MIN_FIT: f64 = 3.0;
-/// Added to the reach of the fit for each pixel of noise, in steps: the fit averages noise out.
-const FIT_PER_NOISE: f64 = 12.0;
-/// Largest reach of the fit, in steps.
-const MAX_FIT: f64 = 6.0;
+/// Reach of the second differences that give a border's bend at a chord's ends, in steps.
+const BEND: isize = 2;
+/// Newton steps to the shortest chord: each gains digits as long as there is a minimum of its own.
+const STEPS: usize = 8;
+/// The shortest chord is found when its ends move by less than this, in steps.
+const CONVERGED: f64 = 1e-3;
+/// How far the shortest chord may be from the shortest between border points, in steps: beyond, the sides are parallel.
+const MAX_SHIFT: f64 = 4.0;
 
 /// An edge of the triangulation as a passage between two discs.
 struct Passage {
@@ -101,7 +103,7 @@ pub fn find(border: &Border, triangulation: &Triangulation, noise: f64) -> Vec<I
     let swept = Swept::new(border);
     let mut found: Vec<Isthmus> = persistent_saddles(border, triangulation, noise)
         .into_iter()
-        .filter_map(|saddle| isthmus_at(border, &swept, triangulation, saddle, noise))
+        .filter_map(|saddle| isthmus_at(border, &swept, triangulation, saddle))
         .collect();
     found.sort_by(|a, b| {
         b.salient.cmp(&a.salient).then(b.persistence.total_cmp(&a.persistence)).then(a.arc[0].total_cmp(&b.arc[0]))
@@ -199,11 +201,10 @@ fn isthmus_at(
     swept: &Swept,
     triangulation: &Triangulation,
     (side, persistence): (usize, f64),
-    noise: f64,
 ) -> Option<Isthmus> {
     let polarity = triangulation.polarity[side / 3];
     let [i, j] = triangulation.ends(side);
-    let [s, t] = refine(border, slide(border, [i, j]), noise);
+    let [s, t] = refine(border, slide(border, [i, j]));
     let length = border.length();
     let (s, t) = (s.rem_euclid(length), t.rem_euclid(length));
     let (p, q) = (border.point_at(s), border.point_at(t));
@@ -266,47 +267,49 @@ fn slide(border: &Border, ends: [usize; 2]) -> [usize; 2] {
     best.1
 }
 
-/// Arc lengths of the ends of the shortest chord near a chord between border points: the minimum of a quadratic fitted to
-/// the squared chord lengths round it.
-fn refine(border: &Border, [i, j]: [usize; 2], noise: f64) -> [f64; 2] {
+/// Arc lengths of the ends of the shortest chord near a chord between border points: where it meets the border, taken for a
+/// smooth curve through its points, at right angles on both ends.
+fn refine(border: &Border, [i, j]: [usize; 2]) -> [f64; 2] {
     let n = border.points.len() as isize;
-    let at = |i: isize| border.points[i.rem_euclid(n) as usize];
+    let at = |i: isize| border.points[i.rem_euclid(n) as usize].coords;
+    let bend = |i: usize| {
+        let i = i as isize;
+        (at(i - BEND) - at(i) * 2.0 + at(i + BEND)) / (BEND * BEND) as f64
+    };
+    let bends = [bend(i), bend(j)];
+    // Point and tangent of a curve through the border points (E. Catmull, R. Rom, 1974), some steps from one of them.
+    let curve = |i: usize, shift: f64| {
+        let k = i as isize + shift.floor() as isize;
+        let t = shift - shift.floor();
+        let [a, b, c, d] = [at(k - 1), at(k), at(k + 1), at(k + 2)];
+        let (linear, square, cube) = ((c - a) / 2.0, a - b * 2.5 + c * 2.0 - d * 0.5, (d - a + (b - c) * 3.0) / 2.0);
+        (b + (linear + (square + cube * t) * t) * t, linear + (square * 2.0 + cube * (3.0 * t)) * t)
+    };
     let start = [i as f64 * border.spacing, j as f64 * border.spacing];
-    let apart = i.abs_diff(j).min(border.points.len() - i.abs_diff(j));
-    let reach = (MIN_FIT + FIT_PER_NOISE * noise).min(MAX_FIT).min(apart as f64 / 3.0).round() as isize;
-    // On a symmetric grid 1, u, v, uv and the squares less their mean are orthogonal: each coefficient is one quotient.
-    let count = (2 * reach + 1) as f64;
-    let square = |a: isize| (a * a) as f64;
-    let mean = (-reach..=reach).map(square).sum::<f64>() / count;
-    let spread = (-reach..=reach).map(|a| (square(a) - mean).powi(2)).sum::<f64>();
-    let (mut fu, mut fv, mut fuu, mut fuv, mut fvv) = (0.0, 0.0, 0.0, 0.0, 0.0);
-    for a in -reach..=reach {
-        let p = at(i as isize + a);
-        let (mut sum, mut first, mut second) = (0.0, 0.0, 0.0);
-        for b in -reach..=reach {
-            let value = (p - at(j as isize + b)).norm_squared();
-            sum += value;
-            first += value * b as f64;
-            second += value * (square(b) - mean);
+    let (mut u, mut v) = (0.0, 0.0);
+    for _ in 0..STEPS {
+        let ((p, dp), (q, dq)) = (curve(i, u), curve(j, v));
+        let chord = p - q;
+        let gradient = [chord.dot(&dp), -chord.dot(&dq)];
+        let (uu, uv, vv) = (dp.dot(&dp) + chord.dot(&bends[0]), -dp.dot(&dq), dq.dot(&dq) - chord.dot(&bends[1]));
+        let determinant = uu * vv - uv * uv;
+        if !(uu > 0.0 && determinant > 0.0) {
+            return start;
         }
-        fu += sum * a as f64;
-        fuu += sum * (square(a) - mean);
-        fv += first;
-        fuv += first * a as f64;
-        fvv += second;
+        let step =
+            [(uv * gradient[1] - vv * gradient[0]) / determinant, (uv * gradient[0] - uu * gradient[1]) / determinant];
+        let longest = step[0].abs().max(step[1].abs());
+        // Far steps are cut short: the bend is known here, not there.
+        let part = 1.0 / longest.max(1.0);
+        (u, v) = (u + step[0] * part, v + step[1] * part);
+        if u.abs().max(v.abs()) > MAX_SHIFT {
+            return start;
+        }
+        if longest < CONVERGED {
+            break;
+        }
     }
-    let squares = mean * count;
-    (fu, fv) = (fu / (squares * count), fv / (squares * count));
-    (fuu, fvv) = (2.0 * fuu / (spread * count), 2.0 * fvv / (spread * count));
-    fuv /= squares * squares;
-    let determinant = fuu * fvv - fuv * fuv;
-    let shift = Vector2::new(fuv * fv - fvv * fu, fuv * fu - fuu * fv) / determinant;
-    // Where the sides are parallel the fit has no minimum of its own, or one far away: then the shortest chord stays.
-    if fuu > 0.0 && determinant > 0.0 && shift.amax() <= reach as f64 {
-        [start[0] + shift.x * border.spacing, start[1] + shift.y * border.spacing]
-    } else {
-        start
-    }
+    [start[0] + u * border.spacing, start[1] + v * border.spacing]
 }
 
 /// Area swept by the ray from the first border point to the others, up to each of them.

@@ -259,8 +259,11 @@ const TIGHT_CONTACT: f64 = 0.6;
 const TIGHT_SHARE: f64 = 0.9;
 /// How many blocks beyond its border a shape's levels matter: the blur of its edge, and the interpolation.
 const BORDER_BLOCKS: usize = 3;
+/// Neighbours of a shape smaller than this, in pixels, stay in its cutout: noise makes them of the outer half of a blurred edge, and
+/// without them, as without the holes in its inner half, the edge would lie elsewhere.
+const MIN_ERASED: usize = 16;
 /// Most differences of neighbouring pixels looked at to measure the noise: beyond, the figure gets no better.
-const NOISE_SAMPLES: usize = 4_000;
+const NOISE_SAMPLES: usize = 2_000;
 /// Blocks of a shape looked at to measure its levels, roughly: beyond, medians get no better.
 const LEVEL_SAMPLES: usize = 1_000;
 
@@ -288,6 +291,7 @@ pub struct Segmenter {
     fine: Components,
     /// For each block the coarse component that owns it, or [`NOBODY`]: its blocks and those next to them.
     owner: Vec<u32>,
+    residual: Vec<f32>,
     crop: Crop,
 }
 
@@ -315,8 +319,9 @@ impl Segmenter {
         self.blocks.fill(frame);
         let mut best: Option<(usize, Segmentation)> = None;
         for candidate in ground::candidates(&self.blocks) {
-            let ground = ground::fit(&self.blocks, candidate);
+            let ground = ground::fit(&self.blocks, candidate, std::mem::take(&mut self.residual));
             let segmentation = self.shapes(frame, &ground, parameters);
+            self.residual = ground.residual;
             let area = segmentation.cutouts.iter().map(|c| c.aoi.width as usize * c.aoi.height as usize).sum();
             if best.as_ref().is_none_or(|(most, _)| area > *most) {
                 best = Some((area, segmentation));
@@ -678,7 +683,9 @@ impl Segmenter {
             pixels.extend_from_slice(&crop.pixels[y * crop.width + left..y * crop.width + right]);
         }
         let ground = crop.ground_level.round().clamp(0.0, 255.0) as u8;
-        for run in self.fine.runs.iter().filter(|r| r.label != index && (top..bottom).contains(&r.row)) {
+        for run in self.fine.runs.iter().filter(|r| {
+            r.label != index && self.fine.list[r.label].area >= MIN_ERASED && (top..bottom).contains(&r.row)
+        }) {
             let (start, end) = (run.start.clamp(left, right), run.end.clamp(left, right));
             pixels[(run.row - top) * width + start - left..(run.row - top) * width + end - left].fill(ground);
         }

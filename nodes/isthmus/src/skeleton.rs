@@ -11,7 +11,7 @@
 //! exact wherever the border's own steps are edges of the triangulation, and a matter of three indices.
 //!
 //! Discs are wide where the border's parts are far apart, so every border point is not needed there: the triangulation takes
-//! one point in several, a step of a hundredth of the shape's size, and halves the step as long as two parts of the border are
+//! one point in several, a step of about a hundredth of the shape's size, and halves the step as long as two parts of the border are
 //! within a few steps of each other.
 //!
 //! Every bump of the border grows a branch. What a branch adds to the shape is how far its last disc reaches beyond
@@ -97,11 +97,11 @@ const MIN_HEIGHT_NOISE: f64 = 8.0;
 /// of the box lie on it as a whole.
 pub const EXOSKELETON_MARGIN: f64 = 0.1;
 
-/// Distance of the triangulated border points, as a part of the square root of the shape's area: a quarter of the radius of the
+/// Distance of the triangulated border points, as a part of the square root of the shape's area: three eighths of the radius of the
 /// tightest curves that the border keeps.
-const STEP: f64 = 0.01;
+const STEP: f64 = 0.015;
 /// Greatest number of border steps from one triangulated point to the next.
-const MAX_STRIDE: usize = 4;
+const MAX_STRIDE: usize = 6;
 /// Where two parts of the border are nearer to each other than this many steps, the step is halved: a passage is then found to
 /// a twenty-fourth of a step.
 const CLOSE: f64 = 3.0;

@@ -82,7 +82,7 @@ fn the_literal_rules_thin_out_the_table_step_by_step() {
 /// The greedy descent of the paper takes a wrong pair early, after which pieces can't be joined up.
 #[test]
 fn backtracking_mends_what_the_greedy_descent_spoils() {
-    let options = Options { rows: 3, columns: 3, clearance: [0.2, 0.2], seed: 1, ..Options::default() };
+    let options = Options { rows: 3, columns: 3, clearance: [0.2, 0.2], seed: 7, ..Options::default() };
     let paper = |backtracks| Params { policy: Policy::Paper, backtracks, ..Params::default() };
     let (greedy, _) = solve(&options, &paper(0));
     assert!(greedy.misplaced > 0 && !greedy.is_perfect(), "{greedy:?}");

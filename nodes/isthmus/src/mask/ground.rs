@@ -82,10 +82,13 @@ impl Blocks {
 }
 
 fn mean_of<const N: usize>(sums: &[u16], rows: usize, plane: &mut Vec<f32>) {
-    let blocks = sums.chunks_exact(N);
-    let rest = blocks.remainder();
+    let (blocks, rest) = sums.as_chunks::<N>();
     let scale = 1.0 / (N * rows) as f32;
-    plane.extend(blocks.map(|b| f32::from(b.iter().sum::<u16>()) * scale));
+    plane.extend(blocks.iter().map(|b| {
+        // Four sums side by side in one number, times four ones side by side: the highest part is their sum.
+        let packed = b.iter().rev().fold(0, |packed, s| packed << 16 | u64::from(*s));
+        (packed.wrapping_mul(0x0001_0001_0001_0001) >> 48) as f32 * scale
+    }));
     if !rest.is_empty() {
         plane.push(f32::from(rest.iter().sum::<u16>()) / (rest.len() * rows) as f32);
     }
@@ -124,10 +127,11 @@ impl Surface {
     pub(super) fn fill_line(&self, row: f64, column: f64, step: f64, levels: &mut [f32]) {
         let c = self.coefficients;
         let v = row * self.scale[1] - 1.0;
-        let (k0, k1, k2) = (c[0] + v * (c[2] + v * c[5]), c[1] + v * c[4], c[3]);
+        let [k0, k1, k2] = [c[0] + v * (c[2] + v * c[5]), c[1] + v * c[4], c[3]].map(|k| k as f32);
+        let (first, step) = ((column * self.scale[0] - 1.0) as f32, (step * self.scale[0]) as f32);
         for (i, level) in levels.iter_mut().enumerate() {
-            let u = (column + i as f64 * step) * self.scale[0] - 1.0;
-            *level = (k0 + u * (k1 + u * k2)) as f32;
+            let u = first + i as u32 as f32 * step;
+            *level = k0 + u * (k1 + u * k2);
         }
     }
 }
@@ -152,10 +156,10 @@ const MIN_RESIDUAL: f32 = 6.0;
 /// Least difference from the ground as a part of what shapes have on the middle: shadows and glare round them have less,
 /// dark print on black more.
 const MIN_RELATIVE_RESIDUAL: f32 = 0.12;
-/// Blocks that are looked at to find the ground: a shape of a thousandth of the frame still has a dozen among them.
-const SAMPLES: usize = 10_000;
+/// Blocks that are looked at to find the ground: a shape of a thousandth of the frame still has several among them.
+const SAMPLES: usize = 5_000;
 /// Blocks used for the fit: more do not make a quadratic any better.
-const FIT_SAMPLES: usize = 2_000;
+const FIT_SAMPLES: usize = 800;
 /// Rounds of fitting the ground and asking again what belongs to it.
 const ROUNDS: usize = 3;
 /// Depths in the frame, as parts of its smaller side, at which rows and columns vote for the ground: beyond scanner edges, and
@@ -244,20 +248,20 @@ fn rim_blocks(blocks: &Blocks) -> impl Iterator<Item = usize> {
     })
 }
 
-/// Fits the ground to a class of blocks, and finds what stands out from it.
-pub(super) fn fit(blocks: &Blocks, candidate: Candidate) -> Ground {
+/// Fits the ground to a class of blocks, and finds what stands out from it; `residual` is memory to be used again.
+pub(super) fn fit(blocks: &Blocks, candidate: Candidate, residual: Vec<f32>) -> Ground {
     let Candidate { mut is_ground } = candidate;
     let mut ground = Ground::default();
     let mut residuals = Vec::with_capacity(is_ground.len());
     for _ in 0..ROUNDS {
         ground.surfaces = blocks.planes.iter().map(|plane| fit_surface(blocks, plane, &is_ground)).collect();
-        let residual = |s: &Sample| {
+        let residual_of = |s: &Sample| {
             let channels = blocks.planes.iter().zip(&ground.surfaces);
             let (column, row) = (s.column as f64, s.row as f64);
             channels.map(|(plane, surface)| (plane[s.block] - surface.at(column, row)).abs()).fold(0.0, f32::max)
         };
         residuals.clear();
-        residuals.extend(blocks.samples.iter().map(residual));
+        residuals.extend(blocks.samples.iter().map(residual_of));
         let scatter: Vec<f32> = residuals.iter().zip(&is_ground).filter(|(_, g)| **g).map(|(r, _)| *r).collect();
         // The median of absolute residuals is 0.67 standard deviations.
         let sigma = median(scatter) / 0.6745;
@@ -278,13 +282,15 @@ pub(super) fn fit(blocks: &Blocks, candidate: Candidate) -> Ground {
         }
     }
     let mut levels = vec![0.0; blocks.columns];
-    ground.residual = vec![0.0; blocks.columns * blocks.rows];
-    for (plane, surface) in blocks.planes.iter().zip(&ground.surfaces) {
+    ground.residual = residual;
+    ground.residual.resize(blocks.columns * blocks.rows, 0.0);
+    for (channel, (plane, surface)) in blocks.planes.iter().zip(&ground.surfaces).enumerate() {
         let rows = plane.chunks_exact(blocks.columns).zip(ground.residual.chunks_exact_mut(blocks.columns));
         for (row, (values, residuals)) in rows.enumerate() {
             surface.fill_line(row as f64, 0.0, 1.0, &mut levels);
             for ((residual, value), level) in residuals.iter_mut().zip(values).zip(&levels) {
-                *residual = residual.max((value - level).abs());
+                let difference = (value - level).abs();
+                *residual = if channel == 0 { difference } else { residual.max(difference) };
             }
         }
     }
