@@ -767,7 +767,7 @@ impl FeaturesRecord {
     }
 }
 
-/// One row of `matches.csv`.
+/// One row of `matches.csv`; what was not computed, because a rule dropped the pair before, is empty.
 #[derive(Serialize)]
 struct MatchRow<'a> {
     positive_piece: &'a str,
@@ -778,10 +778,11 @@ struct MatchRow<'a> {
     path_difference_px: f64,
     shape_distance_px: f64,
     correlation: f64,
-    pos_gap_px2: f64,
-    neg_gap_px2: f64,
-    ave_gap_px: f64,
-    clearance_px: f64,
+    pos_gap_px2: Option<f64>,
+    neg_gap_px2: Option<f64>,
+    ave_gap_px: Option<f64>,
+    residual_px: Option<f64>,
+    clearance_px: Option<f64>,
     support: usize,
     fate: String,
 }
@@ -803,10 +804,11 @@ fn write_csv(path: &Path, pieces: &[Piece], candidates: &[Candidate]) -> Result<
                 path_difference_px: candidate.path_difference,
                 shape_distance_px: candidate.shape_distance,
                 correlation: candidate.correlation,
-                pos_gap_px2: candidate.pos_gap,
-                neg_gap_px2: candidate.neg_gap,
-                ave_gap_px: candidate.ave_gap,
-                clearance_px: candidate.clearance,
+                pos_gap_px2: candidate.posed.map(|p| p.pos_gap),
+                neg_gap_px2: candidate.posed.map(|p| p.neg_gap),
+                ave_gap_px: candidate.posed.map(|p| p.ave_gap),
+                residual_px: candidate.posed.map(|p| p.residual),
+                clearance_px: candidate.posed.map(|p| p.clearance),
                 support: candidate.support,
                 fate: match candidate.fate {
                     Fate::Mated => "mated".into(),
@@ -822,7 +824,7 @@ fn write_csv(path: &Path, pieces: &[Piece], candidates: &[Candidate]) -> Result<
 }
 
 /// Columns of `matches.csv`, as [`MatchRow`] names them.
-const MATCH_COLUMNS: [&str; 14] = [
+const MATCH_COLUMNS: [&str; 15] = [
     "positive_piece",
     "positive_isthmus",
     "negative_piece",
@@ -834,6 +836,7 @@ const MATCH_COLUMNS: [&str; 14] = [
     "pos_gap_px2",
     "neg_gap_px2",
     "ave_gap_px",
+    "residual_px",
     "clearance_px",
     "support",
     "fate",

@@ -58,20 +58,21 @@ fn main() -> anyhow::Result<()> {
                 solver.insert(piece)?;
             }
             solver.solve();
-            let table: Vec<_> = solver.candidates().into_iter().filter(|c| c.residual.is_finite()).collect();
+            let table: Vec<_> =
+                solver.candidates().into_iter().filter_map(|c| c.posed.map(|posed| (c, posed.residual))).collect();
             let mut best: HashMap<(usize, usize), f64> = HashMap::new();
-            for c in &table {
+            for (c, residual) in &table {
                 let least = best.entry((c.negative_piece, c.negative_isthmus)).or_insert(f64::INFINITY);
-                *least = least.min(c.residual);
+                *least = least.min(*residual);
             }
             let mut seen: HashMap<(usize, usize), (bool, f64)> = HashMap::new();
-            for c in &table {
+            for (c, residual) in &table {
                 let pair = (c.positive_piece.min(c.negative_piece), c.positive_piece.max(c.negative_piece));
-                let is_best = c.residual <= best[&(c.negative_piece, c.negative_isthmus)];
+                let is_best = *residual <= best[&(c.negative_piece, c.negative_isthmus)];
                 if truth.contains(&pair) {
                     let entry = seen.entry(pair).or_insert((false, f64::INFINITY));
-                    if c.residual < entry.1 {
-                        *entry = (is_best, c.residual);
+                    if *residual < entry.1 {
+                        *entry = (is_best, *residual);
                     }
                 }
             }

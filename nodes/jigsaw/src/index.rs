@@ -28,6 +28,18 @@ pub(crate) struct Windows {
     pub(crate) path: (f64, f64),
 }
 
+impl Windows {
+    pub(crate) fn let_opening_pass(&self, mouth: &Segment, tab: &Segment) -> bool {
+        let opening = mouth.width - tab.width;
+        opening >= self.opening.0 && opening <= self.opening.1
+    }
+
+    pub(crate) fn let_path_pass(&self, mouth: &Segment, tab: &Segment) -> bool {
+        let path = mouth.path - tab.path;
+        path >= self.path.0 && path <= self.path.1
+    }
+}
+
 /// The tree, implicit: entries ordered so that the median of each range splits it.
 pub(crate) struct Index<'a> {
     entries: Vec<Entry<'a>>,
@@ -133,10 +145,8 @@ impl Query<'_> {
         if entry.piece == self.piece {
             return;
         }
-        let opening = self.mouth.width - entry.segment.width;
-        let path = self.mouth.path - entry.segment.path;
-        let within = |v: f64, w: (f64, f64)| v >= w.0 && v <= w.1;
-        if !within(opening, self.windows.opening) || !within(path, self.windows.path) {
+        let (mouth, tab) = (self.mouth, entry.segment);
+        if !self.windows.let_opening_pass(mouth, tab) || !self.windows.let_path_pass(mouth, tab) {
             return;
         }
         let limit = self.limit();

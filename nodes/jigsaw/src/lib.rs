@@ -6,6 +6,7 @@ pub mod generate;
 
 use nalgebra::Isometry2;
 
+mod contact;
 pub mod correlation;
 mod frame;
 mod index;
@@ -19,7 +20,7 @@ mod search;
 pub mod solver;
 
 pub use params::{Params, ParamsError, Policy};
-pub use solver::{Candidate, Fate, Rule, Solver, SolverError, assemble};
+pub use solver::{Budget, Candidate, Fate, Posed, Rule, Solver, SolverError, assemble};
 
 /// A piece as the solver knows it.
 #[derive(Debug, Clone, PartialEq)]

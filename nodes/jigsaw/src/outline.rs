@@ -7,7 +7,7 @@ use crate::Piece;
 use crate::frame::convex_hull;
 use isthmus::Point;
 use isthmus::isthmus::{Isthmus, Polarity};
-use nalgebra::{Isometry2, Matrix3, Matrix4, Vector2, Vector3, Vector4};
+use nalgebra::Vector2;
 
 /// Samples of an IDF in the shape index: enough for a tab (its finest feature is about a tenth of its path).
 pub(crate) const SHAPE_SAMPLES: usize = 64;
@@ -20,6 +20,9 @@ pub(crate) const KEYS: usize = 8;
 const MAX_EXTENSION: f64 = 0.35;
 /// Cells of the raster along a piece scale: abutting borders then count for less than 0.1 % of overlap.
 const RASTER_CELLS: f64 = 24.0;
+/// Least width of the robust weights, in piece scales: where most of a contact fits exactly already, the rest must
+/// still pull.
+pub(crate) const LEAST_WIDTH: f64 = 0.004;
 /// Length of a straight run, in piece scales, from which on it is taken for a straight edge.
 const STRAIGHT_LENGTH: f64 = 0.4;
 /// How far the border may leave its chord in such a run, in piece scales.
@@ -87,6 +90,8 @@ pub(crate) struct Raster {
 /// A piece made ready.
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) struct Outline {
+    /// Tells it from all others that the solver has seen.
+    pub(crate) serial: u64,
     pub(crate) points: Vec<Point>,
     pub(crate) normals: Vec<Vector2<f32>>,
     pub(crate) spacing: f64,
@@ -107,7 +112,7 @@ pub(crate) struct Outline {
 }
 
 impl Outline {
-    pub(crate) fn new(piece: &Piece) -> Self {
+    pub(crate) fn new(piece: &Piece, serial: u64) -> Self {
         let border = &piece.features.border;
         let points = border.points.clone();
         let n = points.len();
@@ -132,6 +137,7 @@ impl Outline {
             .collect();
         let radius = points.iter().map(|p| (p - centroid).norm()).fold(0.0, f64::max);
         let mut outline = Self {
+            serial,
             raster: Raster::new(&points, area.sqrt() / RASTER_CELLS),
             hull: convex_hull(points.clone()),
             points,
@@ -414,173 +420,4 @@ impl Raster {
         (c >= 0.0 && r >= 0.0 && c < self.columns as f64 && r < self.rows as f64)
             .then(|| r as usize * self.columns + c as usize)
     }
-}
-
-/// Points of the thinned border along a piece scale, for overlap checks.
-const SPARSE_STEP: f64 = 16.0;
-
-/// How deep and over what length the border of `a` runs inside `b`: the sum of depth times length, in square pixels.
-/// For a shallow overlap this is its area.
-fn intrusion(a: &Outline, b: &Outline, b_from_a: &Isometry2<f64>) -> f64 {
-    let stride = ((a.scale / SPARSE_STEP / a.spacing) as usize).max(1);
-    let reach = b.radius * b.radius;
-    let mut sum = 0.0;
-    for p in a.points.iter().step_by(stride) {
-        let p = b_from_a * p;
-        if (p - b.centroid).norm_squared() > reach {
-            continue;
-        }
-        let Some(k) = b.raster.cell_of(p) else { continue };
-        if f64::from(b.raster.distance[k]) > b.raster.cell {
-            continue;
-        }
-        let i = b.raster.nearest[k] as usize;
-        let d = p - b.points[i];
-        let depth = -(d.x * f64::from(b.normals[i].x) + d.y * f64::from(b.normals[i].y));
-        if depth > 0.0 {
-            sum += depth.min(-f64::from(b.raster.distance[k]) + b.raster.cell);
-        }
-    }
-    sum * stride as f64 * a.spacing
-}
-
-/// Whether the innermost point of `a` lies deep inside `b`.
-fn swallows(b: &Outline, a: &Outline, b_from_a: &Isometry2<f64>) -> bool {
-    /// Depth in piece scales: abutting pieces keep their innermost points this far and farther outside.
-    const DEEP: f64 = 0.1;
-    let pole = b_from_a * a.raster.pole;
-    b.raster.cell_of(pole).is_some_and(|cell| f64::from(b.raster.distance[cell]) < -DEEP * b.scale)
-}
-
-/// Area in which two pieces overlap, in square pixels: exact for shallow overlaps, large for deep ones.
-pub(crate) fn overlap_area(a: &Outline, b: &Outline, b_from_a: &Isometry2<f64>) -> f64 {
-    let centre = b_from_a * a.centroid;
-    if (centre - b.centroid).norm() > a.radius + b.radius {
-        return 0.0;
-    }
-    // Copies that lie on one another intrude nowhere: their borders coincide.
-    if swallows(b, a, b_from_a) {
-        return a.area.min(b.area);
-    }
-    intrusion(a, b, b_from_a).max(intrusion(b, a, &b_from_a.inverse()))
-}
-
-/// Least width of the robust weights, in piece scales: where most of a contact fits exactly already, the rest must
-/// still pull.
-pub(crate) const LEAST_WIDTH: f64 = 0.004;
-/// Contacts of fewer rows than this part of a scale are corners that meet, which say nothing about a pose.
-const LEAST_CONTACT: f64 = 0.12;
-
-/// What two outlines in a given pose say about each other.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub(crate) struct Contact {
-    /// Length of border in contact, in pixels.
-    pub(crate) length: f64,
-    /// Mean |distance - clearance| over it, in pixels.
-    pub(crate) residual: f64,
-    /// Median distance, positive for a gap.
-    pub(crate) clearance: f64,
-    /// Middle of the contact, in `b`'s image.
-    pub(crate) centre: Point,
-    /// Normal matrix and right side over the motion (x, y, turn) of `a` at `centre`, in `b`'s image, clearance
-    /// eliminated.
-    pub(crate) hessian: Matrix3<f64>,
-    pub(crate) gradient: Vector3<f64>,
-}
-
-/// Prior of a joint's clearance: mean and standard deviation, and the deviation of a border point, in pixels.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub(crate) struct ClearancePrior {
-    pub(crate) mean: f64,
-    pub(crate) deviation: f64,
-    pub(crate) noise: f64,
-}
-
-/// Follows the border of `a` along that of `b`, within `band` pixels of it, every `stride`-th point.
-pub(crate) fn contact(
-    a: &Outline,
-    b: &Outline,
-    b_from_a: &Isometry2<f64>,
-    band: f64,
-    stride: usize,
-    prior: &ClearancePrior,
-) -> Option<Contact> {
-    /// Normals of borders in contact are opposite to within 45°.
-    const OPPOSED: f32 = -0.7;
-    let n = b.points.len();
-    let reach = (b.radius + band).powi(2);
-    let rotation = b_from_a.rotation;
-    let mut rows: Vec<(f64, Vector2<f64>, Point)> = Vec::new();
-    for (k, p) in a.points.iter().enumerate().step_by(stride) {
-        let p = b_from_a * p;
-        if (p - b.centroid).norm_squared() > reach {
-            continue;
-        }
-        let Some(cell) = b.raster.cell_of(p) else { continue };
-        if f64::from(b.raster.distance[cell]).abs() > band + b.raster.cell {
-            continue;
-        }
-        let mut i = b.raster.nearest[cell] as usize;
-        let mut best = (p - b.points[i]).norm_squared();
-        loop {
-            let (next, previous) = ((i + 1) % n, (i + n - 1) % n);
-            let (dn, dp) = ((p - b.points[next]).norm_squared(), (p - b.points[previous]).norm_squared());
-            if dn < best && dn <= dp {
-                (best, i) = (dn, next);
-            } else if dp < best {
-                (best, i) = (dp, previous);
-            } else {
-                break;
-            }
-        }
-        let q = b.points[i];
-        let along = (b.points[(i + 1) % n] - q).dot(&(p - q));
-        let other = if along >= 0.0 { (i + 1) % n } else { (i + n - 1) % n };
-        let edge = b.points[other] - q;
-        let part = ((p - q).dot(&edge) / edge.norm_squared().max(f64::EPSILON)).clamp(0.0, 1.0);
-        let normal = b.normals[i] * (1.0 - part as f32) + b.normals[other] * part as f32;
-        let mine = rotation * Vector2::new(f64::from(a.normals[k].x), f64::from(a.normals[k].y));
-        if normal.x * mine.x as f32 + normal.y * mine.y as f32 > OPPOSED {
-            continue;
-        }
-        let normal = Vector2::new(f64::from(normal.x), f64::from(normal.y)).normalize();
-        let distance = (p - (q + edge * part)).dot(&normal);
-        if distance.abs() <= band {
-            rows.push((distance, normal, p));
-        }
-    }
-    if rows.len() < 4 || rows.len() as f64 * stride as f64 * a.spacing < LEAST_CONTACT * a.scale {
-        return None;
-    }
-    let mut distances: Vec<f64> = rows.iter().map(|r| r.0).collect();
-    let middle = distances.len() / 2;
-    let clearance = *distances.select_nth_unstable_by(middle, f64::total_cmp).1;
-    let mut off: Vec<f64> = rows.iter().map(|r| (r.0 - clearance).abs()).collect();
-    let spread = *off.select_nth_unstable_by(middle, f64::total_cmp).1;
-    let width = (3.0 * spread).max(LEAST_WIDTH * b.scale);
-    let centre = Point::from(rows.iter().fold(Vector2::zeros(), |s, r| s + r.2.coords) / rows.len() as f64);
-    let mut h = Matrix4::zeros();
-    let mut g = Vector4::zeros();
-    for (distance, normal, p) in &rows {
-        let r = distance - clearance;
-        let w = 1.0 / (1.0 + (r / width).powi(2)).powi(2);
-        let p = p - centre;
-        let j = Vector4::new(normal.x, normal.y, p.x * normal.y - p.y * normal.x, -1.0);
-        h += j * j.transpose() * w;
-        g += j * (w * r);
-    }
-    let pull = (prior.noise.max(spread) / prior.deviation.max(1e-3)).powi(2);
-    h[(3, 3)] += pull;
-    g[3] += pull * (clearance - prior.mean);
-    let column: Vector3<f64> = h.fixed_view::<3, 1>(0, 3).into_owned();
-    let hessian = h.fixed_view::<3, 3>(0, 0).into_owned() - column * column.transpose() / h[(3, 3)];
-    let gradient = g.fixed_rows::<3>(0).into_owned() - column * (g[3] / h[(3, 3)]);
-    Some(Contact {
-        length: rows.len() as f64 * stride as f64 * a.spacing,
-        residual: rows.iter().map(|r| (r.0 - clearance).abs()).sum::<f64>() / rows.len() as f64,
-        clearance,
-        centre,
-        hessian,
-        gradient,
-    })
 }

@@ -10,11 +10,11 @@
 //! puzzle cut without clearance rules 1 and 4 throw away almost half of the true pairs each; that is the paper's
 //! method, kept so that its figures can be reproduced.
 
-use crate::TableCounts;
 use crate::correlation::correlate;
 use crate::outline::{Outline, Segment};
 use crate::placement::{as_posed, rigid_fit};
 use crate::search::Joint;
+use crate::{Rule, TableCounts};
 use isthmus::Point;
 use rayon::prelude::*;
 
@@ -49,60 +49,89 @@ impl Profile {
     }
 }
 
-/// The pairs that are left, ranked by AVE-GAP, and the counts after each rule.
-pub(crate) fn candidates(outlines: &[&Outline]) -> (Vec<Joint>, TableCounts) {
-    // A pixel, or the sampling of the borders where that is coarser.
-    let step = outlines.iter().map(|o| o.spacing).fold(1.0, f64::max);
-    let profiles = |tabs: bool| -> Vec<Vec<Profile>> {
-        outlines
-            .par_iter()
-            .map(|o| {
-                let segments = if tabs { &o.tabs } else { &o.mouths };
-                segments.iter().map(|s| Profile::new(o, s, step, !tabs)).collect()
-            })
-            .collect()
-    };
-    let (tabs, mouths) = (profiles(true), profiles(false));
-    let found: Vec<(Vec<Joint>, TableCounts)> = (0..outlines.len())
+/// Judges pairs by the rules.
+pub(crate) struct Judge<'a> {
+    outlines: &'a [&'a Outline],
+    tabs: Vec<Vec<Profile>>,
+    mouths: Vec<Vec<Profile>>,
+}
+
+impl<'a> Judge<'a> {
+    pub(crate) fn new(outlines: &'a [&'a Outline]) -> Self {
+        // A pixel, or the sampling of the borders where that is coarser.
+        let step = outlines.iter().map(|o| o.spacing).fold(1.0, f64::max);
+        let profiles = |tabs: bool| -> Vec<Vec<Profile>> {
+            outlines
+                .par_iter()
+                .map(|o| {
+                    let segments = if tabs { &o.tabs } else { &o.mouths };
+                    segments.iter().map(|s| Profile::new(o, s, step, !tabs)).collect()
+                })
+                .collect()
+        };
+        Self { outlines, tabs: profiles(true), mouths: profiles(false) }
+    }
+
+    /// The pair as a candidate, or the rule that drops it.
+    pub(crate) fn pair(&self, (a, tab): (usize, usize), (b, mouth): (usize, usize)) -> Result<Joint, Rule> {
+        let (other, segment) = (&self.outlines[a].tabs[tab], &self.outlines[b].mouths[mouth]);
+        if segment.width < other.width {
+            return Err(Rule::Opening);
+        }
+        if (segment.path - other.path).abs() > LENGTH * segment.path.max(other.path) {
+            return Err(Rule::PathLength);
+        }
+        let (f, g) = (&self.tabs[a][tab], &self.mouths[b][mouth]);
+        let best = correlate(&f.distances, &g.distances, TAKING_PART, REACH);
+        if best.value < CORRELATION {
+            return Err(Rule::Correlation);
+        }
+        let from = best.offset.max(0) as usize;
+        let to = f.points.len().min((best.offset + g.points.len() as i64).max(0) as usize);
+        let shifted = (from as i64 - best.offset).max(0) as usize;
+        let pose = rigid_fit(&f.points[from..to], &g.points[shifted..]);
+        let fit = as_posed(other, segment, &pose, self.outlines[b].scale).ok_or(Rule::Overlap)?;
+        let gap = fit.pos_gap + fit.neg_gap;
+        if fit.pos_gap > OVERLAP * gap {
+            return Err(Rule::Overlap);
+        }
+        let ave_gap = gap / other.path;
+        Ok(Joint { a, tab, b, mouth, fit: crate::placement::Fit { ave_gap, residual: ave_gap, ..fit } })
+    }
+}
+
+/// The pairs that are left, the counts after each rule, and whether all pairs were judged before `late` said to stop.
+pub(crate) fn candidates(outlines: &[&Outline], late: &(dyn Fn() -> bool + Sync)) -> (Vec<Joint>, TableCounts, bool) {
+    let judge = Judge::new(outlines);
+    let found: Vec<(Vec<Joint>, TableCounts, bool)> = (0..outlines.len())
         .into_par_iter()
         .map(|b| {
             let mut counts = TableCounts::default();
             let mut joints = Vec::new();
-            for (mouth, segment) in outlines[b].mouths.iter().enumerate() {
+            if late() {
+                return (joints, counts, false);
+            }
+            for mouth in 0..outlines[b].mouths.len() {
                 for a in (0..outlines.len()).filter(|a| *a != b) {
-                    for (tab, other) in outlines[a].tabs.iter().enumerate() {
+                    for tab in 0..outlines[a].tabs.len() {
                         counts.pairs += 1;
-                        if segment.width < other.width {
-                            continue;
-                        }
-                        counts.after_opening += 1;
-                        if (segment.path - other.path).abs() > LENGTH * segment.path.max(other.path) {
-                            continue;
-                        }
-                        counts.after_length += 1;
-                        let (f, g) = (&tabs[a][tab], &mouths[b][mouth]);
-                        let best = correlate(&f.distances, &g.distances, TAKING_PART, REACH);
-                        if best.value < CORRELATION {
-                            continue;
-                        }
-                        counts.after_correlation += 1;
-                        let from = best.offset.max(0) as usize;
-                        let to = f.points.len().min((best.offset + g.points.len() as i64).max(0) as usize);
-                        let shifted = (from as i64 - best.offset).max(0) as usize;
-                        let pose = rigid_fit(&f.points[from..to], &g.points[shifted..]);
-                        let Some(fit) = as_posed(other, segment, &pose, outlines[b].scale) else { continue };
-                        let gap = fit.pos_gap + fit.neg_gap;
-                        if fit.pos_gap > OVERLAP * gap {
-                            continue;
-                        }
-                        counts.after_overlap += 1;
-                        let ave_gap = gap / other.path;
-                        let fit = crate::placement::Fit { ave_gap, residual: ave_gap, ..fit };
-                        joints.push(Joint { a, tab, b, mouth, fit });
+                        let judged = judge.pair((a, tab), (b, mouth));
+                        let passed = match &judged {
+                            Err(Rule::Opening) => 0,
+                            Err(Rule::PathLength) => 1,
+                            Err(Rule::Correlation) => 2,
+                            Err(_) => 3,
+                            Ok(_) => 4,
+                        };
+                        counts.after_opening += usize::from(passed > 0);
+                        counts.after_length += usize::from(passed > 1);
+                        counts.after_correlation += usize::from(passed > 2);
+                        counts.after_overlap += usize::from(passed > 3);
+                        joints.extend(judged);
                     }
                 }
             }
-            (joints, counts)
+            (joints, counts, true)
         })
         .collect();
     let mut table = TableCounts {
@@ -111,13 +140,15 @@ pub(crate) fn candidates(outlines: &[&Outline]) -> (Vec<Joint>, TableCounts) {
         ..TableCounts::default()
     };
     let mut joints = Vec::new();
-    for (some, counts) in found {
+    let mut whole = true;
+    for (some, counts, finished) in found {
         joints.extend(some);
+        whole &= finished;
         table.pairs += counts.pairs;
         table.after_opening += counts.after_opening;
         table.after_length += counts.after_length;
         table.after_correlation += counts.after_correlation;
         table.after_overlap += counts.after_overlap;
     }
-    (joints, table)
+    (joints, table, whole)
 }

@@ -11,13 +11,14 @@
 //! 5. *Verification*: pieces that overlap or don't follow their neighbours are taken out (islands split at bad
 //!    contacts), and growth is tried again without them; a step that loses more than it brings is undone.
 
+use crate::contact::{ClearancePrior, Contact, Memory};
 use crate::loops::{self, Edge, Slot, Tolerance, conflict, difference};
-use crate::outline::{ClearancePrior, Contact, Outline, contact, overlap_area};
+use crate::outline::Outline;
 use crate::posegraph::{Factor, minimise};
+use crate::solver::Budget;
 use crate::{Params, Policy, placement};
 use nalgebra::{Isometry2, Matrix3, Point2, Translation2, UnitComplex, Vector2};
 use std::collections::{BTreeMap, HashMap};
-use std::time::Instant;
 
 /// Overlap of two pieces that can't be a matter of drift or clearance, in squared piece scales.
 const OVERLAP: f64 = 0.02;
@@ -144,7 +145,8 @@ const SWING: f64 = 0.008;
 struct Assembler<'a> {
     outlines: &'a [&'a Outline],
     params: &'a Params,
-    deadline: Option<Instant>,
+    memory: &'a Memory,
+    budget: &'a dyn Budget,
     edges: Vec<Edge>,
     /// Candidates at each piece.
     at: Vec<Vec<usize>>,
@@ -160,7 +162,13 @@ struct Assembler<'a> {
 }
 
 /// Assembles; `joints` are in the order of ranks.
-pub(crate) fn assemble(outlines: &[&Outline], joints: &[Joint], params: &Params, deadline: Option<Instant>) -> Outcome {
+pub(crate) fn assemble(
+    outlines: &[&Outline],
+    joints: &[Joint],
+    params: &Params,
+    memory: &Memory,
+    budget: &dyn Budget,
+) -> Outcome {
     let n = outlines.len();
     if n == 0 {
         return Outcome::default();
@@ -191,7 +199,8 @@ pub(crate) fn assemble(outlines: &[&Outline], joints: &[Joint], params: &Params,
     let mut assembler = Assembler {
         outlines,
         params,
-        deadline,
+        memory,
+        budget,
         edges,
         at,
         scale,
@@ -323,7 +332,7 @@ impl Assembler<'_> {
     }
 
     fn late(&mut self) -> bool {
-        if self.deadline.is_some_and(|d| Instant::now() >= d) {
+        if self.budget.spent() >= 1.0 {
             self.partial = true;
         }
         self.partial
@@ -612,7 +621,7 @@ impl Assembler<'_> {
                     continue;
                 }
                 let q_from_p = self.state.pose[q].inverse() * pose;
-                let area = overlap_area(self.outlines[p], self.outlines[q], &q_from_p);
+                let area = self.memory.overlap(self.outlines[p], self.outlines[q], &q_from_p);
                 worst = worst.max(area / (self.outlines[p].scale * self.outlines[q].scale));
                 if worst > self.tolerated() {
                     return worst;
@@ -625,22 +634,20 @@ impl Assembler<'_> {
     /// Pairs of pieces of one island near enough to touch.
     fn neighbours(&self, island: usize) -> Vec<(usize, usize)> {
         let members = &self.state.members[island];
-        let cell = members.iter().map(|k| self.outlines[*k].radius).fold(0.0, f64::max) * 2.0 + 1.0;
-        let mut grid: BTreeMap<(i64, i64), Vec<usize>> = BTreeMap::new();
-        let centre = |k: usize| self.state.pose[k] * self.outlines[k].centroid;
-        for &k in members {
-            let c = centre(k);
-            grid.entry(((c.x / cell).floor() as i64, (c.y / cell).floor() as i64)).or_default().push(k);
-        }
+        let mut placed: Vec<(f64, f64, usize)> =
+            members.iter().map(|k| (self.centre_of(*k), *k)).map(|(c, k)| (c.x, c.y, k)).collect();
+        placed.sort_by(|p, q| p.0.total_cmp(&q.0));
+        let reach = 2.0 * members.iter().map(|k| self.outlines[*k].radius).fold(0.0, f64::max);
         let mut pairs = Vec::new();
-        for &p in members {
-            let c = centre(p);
-            let (x, y) = ((c.x / cell).floor() as i64, (c.y / cell).floor() as i64);
-            for (dx, dy) in (-1..=1).flat_map(|dx| (-1..=1).map(move |dy| (dx, dy))) {
-                for &q in grid.get(&(x + dx, y + dy)).into_iter().flatten() {
-                    if q > p && (centre(q) - c).norm() <= self.outlines[p].radius + self.outlines[q].radius {
-                        pairs.push((p, q));
-                    }
+        // A sweep along x: only what is within reach there is compared.
+        for (i, (x, y, p)) in placed.iter().enumerate() {
+            for (other_x, other_y, q) in &placed[i + 1..] {
+                if other_x - x > reach {
+                    break;
+                }
+                let near = self.outlines[*p].radius + self.outlines[*q].radius;
+                if (other_x - x).powi(2) + (other_y - y).powi(2) <= near * near {
+                    pairs.push((*p.min(q), *p.max(q)));
                 }
             }
         }
@@ -692,9 +699,7 @@ impl Assembler<'_> {
     }
 
     fn contact_of(&self, p: usize, q: usize, q_from_p: &Isometry2<f64>, step: f64) -> Option<Contact> {
-        let (a, b) = (self.outlines[p], self.outlines[q]);
-        let stride = ((a.scale * step / a.spacing) as usize).max(1);
-        contact(a, b, q_from_p, CONTACT_BAND * self.scale, stride, &self.prior)
+        self.memory.contact(self.outlines[p], self.outlines[q], q_from_p, (CONTACT_BAND, step), &self.prior)
     }
 
     fn refine_all(&mut self, rounds: usize, step: f64) {
@@ -844,7 +849,7 @@ impl Assembler<'_> {
             for island in 0..self.state.members.len() {
                 for (p, q) in self.neighbours(island) {
                     let pose = self.state.pose[q].inverse() * self.state.pose[p];
-                    let area = overlap_area(self.outlines[p], self.outlines[q], &pose);
+                    let area = self.memory.overlap(self.outlines[p], self.outlines[q], &pose);
                     if area <= OVERLAP * self.outlines[p].scale * self.outlines[q].scale {
                         continue;
                     }
@@ -974,7 +979,7 @@ impl Assembler<'_> {
             let here = pose * self.state.pose[p];
             for &q in &self.state.members[ib] {
                 let q_from_p = self.state.pose[q].inverse() * here;
-                let area = overlap_area(self.outlines[p], self.outlines[q], &q_from_p);
+                let area = self.memory.overlap(self.outlines[p], self.outlines[q], &q_from_p);
                 if area > self.tolerated() * self.outlines[p].scale * self.outlines[q].scale {
                     losers.push(if weight(p) < weight(q) { p } else { q });
                 }

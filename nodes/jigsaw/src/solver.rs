@@ -1,8 +1,8 @@
 //! The incremental solver: pieces come and go, candidates are kept, a solution is made on demand.
 
+use crate::contact::Memory;
 use crate::correlation::correlate;
-use crate::index::shape_distance;
-use crate::index::{Entry, Hit, Index, Windows};
+use crate::index::{Entry, Hit, Index, Windows, shape_distance};
 use crate::outline::{Outline, Segment};
 use crate::paper;
 use crate::search::{self, Joint, Outcome};
@@ -11,7 +11,8 @@ use nalgebra::Isometry2;
 use rayon::prelude::*;
 use std::collections::HashMap;
 use std::sync::Arc;
-use std::time::{Duration, Instant};
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::Instant;
 use thiserror::Error;
 
 /// Window on the difference of mouth and neck width, in piece scales: clearance on both sides (3 % each) and the
@@ -34,7 +35,9 @@ pub enum Rule {
     Shape,
     /// Eq. 1 is too low.
     Correlation,
-    /// The two overlap too much, or the borders don't follow each other.
+    /// The borders don't follow each other in the rough pose, or far worse than those of others.
+    Placement,
+    /// The two overlap too much, or the borders don't follow each other in the refined pose.
     Overlap,
     /// Another mating of the tab, the mouth or the two pieces is better.
     Rival,
@@ -70,6 +73,19 @@ pub struct Candidate {
     pub shape_distance: f64,
     /// Best value of Eq. 1.
     pub correlation: f64,
+    /// The refined pose; none if a rule dropped the pair before it was refined.
+    pub posed: Option<Posed>,
+    /// How many loops of pieces close over it.
+    pub support: usize,
+    /// What became of it in the last solution.
+    pub fate: Fate,
+}
+
+/// A candidate in its refined pose (for the paper's rules: in the pose of its correlation).
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Posed {
+    /// `p_negative_image = negative_from_positive * p_positive_image`.
+    pub negative_from_positive: Isometry2<f64>,
     /// Area of overlap (POS-GAP), in square pixels.
     pub pos_gap: f64,
     /// Area of underlap (NEG-GAP), in square pixels.
@@ -80,13 +96,33 @@ pub struct Candidate {
     pub residual: f64,
     /// Fitted clearance, in pixels.
     pub clearance: f64,
-    /// How many loops of pieces close over it.
-    pub support: usize,
-    /// Pose: `p_negative_image = negative_from_positive * p_positive_image`.
-    pub negative_from_positive: Isometry2<f64>,
-    /// What became of it in the last solution.
-    pub fate: Fate,
 }
+
+/// When a solution has to come to an end. [`Solver::solve`] measures the time against [`Params::time_budget`]; another
+/// measure can be given to [`Solver::solve_within`].
+pub trait Budget: Sync {
+    /// The part that is used up; from 1 on the best assembly so far is taken.
+    fn spent(&self) -> f64;
+}
+
+/// Wall-clock time; without a limit it never runs out.
+struct Time {
+    begin: Instant,
+    seconds: f64,
+}
+
+impl Budget for Time {
+    fn spent(&self) -> f64 {
+        if self.seconds > 0.0 { self.begin.elapsed().as_secs_f64() / self.seconds } else { 0.0 }
+    }
+}
+
+/// Part of the budget after which no more candidates are looked for: what has been found is to be assembled, too.
+const MATCHING_SHARE: f64 = 0.5;
+
+/// Puzzles of up to so many pairs of a tab and a mouth have every pair in the candidate table (the paper's 24 pieces have
+/// 2377; this is some 60 pieces). Of larger ones the refined pairs are listed, and the rest counted.
+const LISTED_PAIRS: usize = 25_000;
 
 /// A piece that can't be taken in.
 #[derive(Debug, Clone, PartialEq, Error)]
@@ -127,6 +163,29 @@ struct Match {
     fine: Option<placement::Fit>,
 }
 
+/// The tabs that resemble a mouth most.
+#[derive(Debug, Clone, Default)]
+struct List {
+    /// Nearest first.
+    matches: Vec<Match>,
+    /// Place and fit of those that were good enough to be refined; none where they have to be chosen.
+    fits: Option<Vec<(usize, placement::Fit)>>,
+}
+
+/// What is kept of one piece.
+#[derive(Debug, Clone)]
+struct Kept {
+    /// Number that no other piece of this solver has had.
+    serial: u64,
+    outline: Option<Outline>,
+    /// For each mouth the nearest tabs.
+    lists: Vec<List>,
+    /// Whether the lists know all tabs that have been offered.
+    current: bool,
+    /// Whether its own tabs have been offered to all others.
+    offered: bool,
+}
+
 /// The solver. Pieces are taken in one by one; [`Solver::solve`] matches what is new and assembles all.
 #[derive(Debug, Clone)]
 pub struct Solver {
@@ -134,9 +193,9 @@ pub struct Solver {
     pool: Option<Arc<rayon::ThreadPool>>,
     pieces: Vec<Piece>,
     index_of: HashMap<String, usize>,
-    outlines: Vec<Option<Outline>>,
-    /// For each piece and mouth the nearest tabs; `None` where they have to be looked for.
-    matches: Vec<Option<Vec<Vec<Match>>>>,
+    kept: Vec<Kept>,
+    serials: u64,
+    memory: Memory,
     /// What the last solution was made from, for [`Solver::candidates`].
     last: Option<Solution>,
 }
@@ -146,8 +205,8 @@ pub struct Solver {
 struct Solution {
     order: Vec<usize>,
     joints: Vec<Joint>,
-    shape_distances: Vec<f64>,
     outcome: Outcome,
+    table: TableCounts,
 }
 
 impl Solver {
@@ -174,8 +233,9 @@ impl Solver {
             pool,
             pieces: Vec::new(),
             index_of: HashMap::new(),
-            outlines: Vec::new(),
-            matches: Vec::new(),
+            kept: Vec::new(),
+            serials: 0,
+            memory: Memory::default(),
             last: None,
         })
     }
@@ -206,8 +266,8 @@ impl Solver {
         let index = self.pieces.len();
         self.index_of.insert(piece.id.clone(), index);
         self.pieces.push(piece);
-        self.outlines.push(None);
-        self.matches.push(None);
+        self.serials += 1;
+        self.kept.push(Kept { serial: self.serials, outline: None, lists: Vec::new(), current: false, offered: false });
         Ok(index)
     }
 
@@ -217,15 +277,17 @@ impl Solver {
         for other in self.index_of.values_mut().filter(|other| **other > index) {
             *other -= 1;
         }
-        self.outlines.remove(index);
-        self.matches.remove(index);
-        for lists in &mut self.matches {
-            // A mouth that loses a candidate may gain the next best one: it is looked for again.
-            if lists.iter().flatten().flatten().any(|m| m.hit.piece as usize == index) {
-                *lists = None;
-            }
-            for m in lists.iter_mut().flatten().flatten() {
-                if m.hit.piece as usize > index {
+        self.kept.remove(index);
+        for kept in &mut self.kept {
+            for list in &mut kept.lists {
+                let before = list.matches.len();
+                list.matches.retain(|m| m.hit.piece as usize != index);
+                // A mouth that loses a candidate may gain the next best one: it is looked for again.
+                if list.matches.len() < before {
+                    kept.current = false;
+                    list.fits = None;
+                }
+                for m in list.matches.iter_mut().filter(|m| m.hit.piece as usize > index) {
                     m.hit.piece -= 1;
                 }
             }
@@ -238,23 +300,28 @@ impl Solver {
     pub fn reset(&mut self) {
         self.pieces.clear();
         self.index_of.clear();
-        self.outlines.clear();
-        self.matches.clear();
+        self.kept.clear();
+        self.memory = Memory::default();
         self.last = None;
     }
 
-    /// The best assembly of the pieces that are there.
+    /// The best assembly of the pieces that are there, within [`Params::time_budget`].
     pub fn solve(&mut self) -> Assembly {
+        let time = Time { begin: Instant::now(), seconds: self.params.time_budget };
+        self.solve_within(&time)
+    }
+
+    /// The best assembly of the pieces that are there that a budget allows. What is not done for want of it is done by
+    /// the next solution.
+    pub fn solve_within(&mut self, budget: &dyn Budget) -> Assembly {
         match self.pool.clone() {
-            Some(pool) => pool.install(|| self.solve_here()),
-            None => self.solve_here(),
+            Some(pool) => pool.install(|| self.solve_here(budget)),
+            None => self.solve_here(budget),
         }
     }
 
-    fn solve_here(&mut self) -> Assembly {
+    fn solve_here(&mut self, budget: &dyn Budget) -> Assembly {
         let begin = Instant::now();
-        let deadline =
-            (self.params.time_budget > 0.0).then(|| begin + Duration::from_secs_f64(self.params.time_budget));
         // Ranks by id make the result independent of the order of insertion.
         let mut order: Vec<usize> = (0..self.pieces.len()).collect();
         order.sort_by(|p, q| self.pieces[*p].id.cmp(&self.pieces[*q].id));
@@ -263,46 +330,43 @@ impl Solver {
             rank[*k] = r;
         }
         let pieces = &self.pieces;
-        self.outlines.par_iter_mut().enumerate().for_each(|(k, outline)| {
-            outline.get_or_insert_with(|| Outline::new(&pieces[k]));
+        self.kept.par_iter_mut().enumerate().for_each(|(k, kept)| {
+            kept.outline.get_or_insert_with(|| Outline::new(&pieces[k], kept.serial));
         });
-        let outlines: Vec<&Outline> = order.iter().filter_map(|k| self.outlines[*k].as_ref()).collect();
-        let (joints, shape_distances, table) = if self.params.policy == Policy::Paper {
-            let (joints, table) = paper::candidates(&outlines);
-            let distances = joints
-                .iter()
-                .map(|j| f64::from(shape_distance(&outlines[j.a].tabs[j.tab], &outlines[j.b].mouths[j.mouth])))
-                .collect();
-            (joints, distances, Some(table))
+        let (joints, table, whole) = if self.params.policy == Policy::Paper {
+            paper::candidates(&ranked(&self.kept, &order), &|| budget.spent() >= MATCHING_SHARE)
         } else {
-            drop(outlines);
-            self.match_new(&rank);
-            let (joints, distances) = self.joints(&order, &rank);
-            (joints, distances, None)
+            let whole = self.match_new(&rank, budget);
+            let (joints, kept) = self.joints(&order, &rank);
+            let table = count(&ranked(&self.kept, &order), &joints, kept);
+            (joints, table, whole)
         };
         let matched = Instant::now();
-        let outlines: Vec<&Outline> = order.iter().filter_map(|k| self.outlines[*k].as_ref()).collect();
-        let outcome = search::assemble(&outlines, &joints, &self.params, deadline);
+        self.memory.next_solution();
+        let outlines = ranked(&self.kept, &order);
+        let outcome = search::assemble(&outlines, &joints, &self.params, &self.memory, budget);
         let mut assembly = report(&order, &outlines, &joints, &outcome);
-        assembly.table = table.unwrap_or_else(|| count(&outlines, &joints));
-        assembly.table.backtracks = outcome.backtracks;
-        assembly.partial = outcome.partial;
+        assembly.table = TableCounts { backtracks: outcome.backtracks, ..table };
+        assembly.partial = outcome.partial || !whole;
         assembly.timings =
             Timings { matching: (matched - begin).as_secs_f64(), assembly: matched.elapsed().as_secs_f64() };
-        self.last = Some(Solution { order, joints, shape_distances, outcome });
+        self.last = Some(Solution { order, joints, outcome, table });
         assembly
     }
 
-    /// Finds the candidates of new mouths among all tabs, and of old mouths among the new tabs.
-    fn match_new(&mut self, rank: &[usize]) {
-        let fresh: Vec<usize> = (0..self.pieces.len()).filter(|k| self.matches[*k].is_none()).collect();
-        if fresh.is_empty() {
-            return;
+    /// Finds the candidates of new mouths among all tabs, and of old mouths among the new tabs; tells whether the budget
+    /// was enough for all.
+    fn match_new(&mut self, rank: &[usize], budget: &dyn Budget) -> bool {
+        if self.kept.iter().all(|k| k.current && k.offered) {
+            return true;
         }
-        let outlines: Vec<&Outline> = self.outlines.iter().flatten().collect();
-        let entries = |pieces: &[usize]| -> Vec<Entry> {
+        // Lists and outlines are taken apart, so that the ones can be filled while the others are read.
+        let mut lists: Vec<(bool, Vec<List>)> =
+            self.kept.iter_mut().map(|k| (k.current, std::mem::take(&mut k.lists))).collect();
+        let outlines: Vec<&Outline> = self.kept.iter().filter_map(|k| k.outline.as_ref()).collect();
+        let entries = |pieces: &mut dyn Iterator<Item = usize>| -> Vec<Entry> {
             let mut entries = Vec::new();
-            for &piece in pieces {
+            for piece in pieces {
                 entries.extend(outlines[piece].tabs.iter().enumerate().map(|(tab, segment)| Entry {
                     piece: piece as u32,
                     tab: tab as u32,
@@ -312,55 +376,71 @@ impl Solver {
             }
             entries
         };
-        let everything: Vec<usize> = (0..outlines.len()).collect();
-        let all = Index::new(entries(&everything));
-        let new = Index::new(entries(&fresh));
-        let keep = self.params.candidates;
+        let all = Index::new(entries(&mut (0..outlines.len())));
+        let new = Index::new(entries(&mut (0..outlines.len()).filter(|k| !self.kept[*k].offered)));
+        let most = self.params.candidates;
         let free = self.params.fit_clearance;
-        self.matches.par_iter_mut().enumerate().for_each_init(placement::Feet::default, |feet, (piece, lists)| {
+        let whole = AtomicBool::new(true);
+        lists.par_iter_mut().enumerate().for_each_init(placement::Feet::default, |feet, (piece, (current, lists))| {
+            if budget.spent() >= MATCHING_SHARE {
+                whole.store(false, Ordering::Relaxed);
+                *current = false;
+                return;
+            }
             let outline = outlines[piece];
-            let index = if lists.is_none() { &all } else { &new };
-            let lists = lists.get_or_insert_with(|| vec![Vec::new(); outline.mouths.len()]);
+            let index = if *current { &new } else { &all };
+            lists.resize(outline.mouths.len(), List::default());
             for (mouth, list) in outline.mouths.iter().zip(lists) {
-                for hit in index.nearest(mouth, piece as u32, &windows(outline), keep) {
-                    let place = list.partition_point(|m: &Match| m.hit.order(&hit).is_lt());
-                    let known = list.get(place).is_some_and(|m| (m.hit.piece, m.hit.tab) == (hit.piece, hit.tab));
-                    if place >= keep || known {
+                let matches = &mut list.matches;
+                // Ranks shift with each new id.
+                matches.iter_mut().for_each(|m| m.hit.rank = rank[m.hit.piece as usize] as u32);
+                for hit in index.nearest(mouth, piece as u32, &windows(outline), most) {
+                    let place = matches.partition_point(|m: &Match| m.hit.order(&hit).is_lt());
+                    let known = matches.get(place).is_some_and(|m| (m.hit.piece, m.hit.tab) == (hit.piece, hit.tab));
+                    if place >= most || known {
                         continue;
                     }
                     let tab = &outlines[hit.piece as usize].tabs[hit.tab as usize];
                     let rough = placement::rough(tab, mouth, outline.scale, free, feet);
-                    list.insert(place, Match { hit, rough, coarse: None, fine: None });
-                    list.truncate(keep);
+                    matches.insert(place, Match { hit, rough, coarse: None, fine: None });
+                    matches.truncate(most);
+                    list.fits = None;
                 }
-                refine(list, mouth, &outlines, (outline.scale, free), feet);
+                let choose = || refine(matches, mouth, &outlines, (outline.scale, free), feet);
+                list.fits.get_or_insert_with(choose);
             }
+            *current = true;
         });
+        for (kept, (current, lists)) in self.kept.iter_mut().zip(lists) {
+            (kept.current, kept.lists) = (current, lists);
+            kept.offered = true;
+        }
+        whole.into_inner()
     }
 
-    /// The refined candidates in ranks, and their shape distances.
-    fn joints(&self, order: &[usize], rank: &[usize]) -> (Vec<Joint>, Vec<f64>) {
+    /// The refined candidates in ranks, and how many the index keeps.
+    fn joints(&self, order: &[usize], rank: &[usize]) -> (Vec<Joint>, usize) {
         let mut joints = Vec::new();
-        let mut distances = Vec::new();
+        let mut near = 0;
         for &piece in order {
-            let scale = self.outlines[piece].as_ref().map_or(1.0, |o| o.scale);
-            for (mouth, list) in self.matches[piece].iter().flatten().enumerate() {
-                for (place, fit) in best_fits(list, scale) {
-                    let m = &list[place];
-                    let (a, b) = (rank[m.hit.piece as usize], rank[piece]);
-                    joints.push(Joint { a, tab: m.hit.tab as usize, b, mouth, fit });
-                    distances.push(f64::from(m.hit.distance));
+            for (mouth, list) in self.kept[piece].lists.iter().enumerate() {
+                near += list.matches.len();
+                for (place, fit) in list.fits.iter().flatten() {
+                    let hit = &list.matches[*place].hit;
+                    let (a, b) = (rank[hit.piece as usize], rank[piece]);
+                    joints.push(Joint { a, tab: hit.tab as usize, b, mouth, fit: *fit });
                 }
             }
         }
-        (joints, distances)
+        (joints, near)
     }
 
-    /// The candidate table of the last [`Solver::solve`]: each refined candidate with its figures and its fate. What
-    /// the windows and the shape index drop before is counted in [`Assembly::table`] only.
+    /// The candidate table of the last [`Solver::solve`]: pairs of a tab and a mouth of different pieces, each with its
+    /// figures and its fate. Of small puzzles (up to 25 000 pairs, some 60 pieces) every pair is listed, and the rows
+    /// add up to [`Assembly::table`]; of larger ones only the pairs that were refined are, and the rest is counted there.
     pub fn candidates(&self) -> Vec<Candidate> {
-        let Some(Solution { order, joints, shape_distances, outcome }) = &self.last else { return Vec::new() };
-        let outlines: Vec<&Outline> = order.iter().filter_map(|k| self.outlines[*k].as_ref()).collect();
+        let Some(Solution { order, joints, outcome, table }) = &self.last else { return Vec::new() };
+        let outlines = ranked(&self.kept, order);
         let mut mated = vec![false; joints.len()];
         let mut taken = std::collections::HashSet::new();
         for (k, _) in &outcome.matings {
@@ -369,39 +449,87 @@ impl Solver {
             taken.insert((true, j.a, j.tab));
             taken.insert((false, j.b, j.mouth));
         }
-        let describe = |(k, j): (usize, &Joint)| {
-            let (tab, mouth) = (&outlines[j.a].tabs[j.tab], &outlines[j.b].mouths[j.mouth]);
+        let describe = |(a, tab): (usize, usize), (b, mouth): (usize, usize)| {
+            let (t, m) = (&outlines[a].tabs[tab], &outlines[b].mouths[mouth]);
+            Candidate {
+                positive_piece: order[a],
+                positive_isthmus: t.isthmus,
+                negative_piece: order[b],
+                negative_isthmus: m.isthmus,
+                opening: m.width - t.width,
+                path_difference: m.path - t.path,
+                shape_distance: f64::from(shape_distance(t, m)),
+                correlation: correlation_of(t, m),
+                posed: None,
+                support: 0,
+                fate: Fate::Dropped(Rule::Shape),
+            }
+        };
+        let refined = |(k, j): (usize, &Joint)| {
             let rival = taken.contains(&(true, j.a, j.tab)) || taken.contains(&(false, j.b, j.mouth));
             let fate = if mated[k] {
                 Fate::Mated
-            } else if hopeless(j, outlines[j.b]) {
+            } else if self.params.policy == Policy::Standard && hopeless(j, outlines[j.b]) {
                 Fate::Dropped(Rule::Overlap)
             } else if rival {
                 Fate::Dropped(Rule::Rival)
             } else {
                 Fate::Dropped(Rule::Support)
             };
-            Candidate {
-                positive_piece: order[j.a],
-                positive_isthmus: tab.isthmus,
-                negative_piece: order[j.b],
-                negative_isthmus: mouth.isthmus,
-                opening: mouth.width - tab.width,
-                path_difference: mouth.path - tab.path,
-                shape_distance: shape_distances[k],
-                correlation: correlation_of(tab, mouth),
+            let posed = Posed {
+                negative_from_positive: j.fit.negative_from_positive,
                 pos_gap: j.fit.pos_gap,
                 neg_gap: j.fit.neg_gap,
                 ave_gap: j.fit.ave_gap,
                 residual: j.fit.residual,
                 clearance: j.fit.clearance,
+            };
+            Candidate {
+                posed: Some(posed),
                 support: outcome.support[k],
-                negative_from_positive: j.fit.negative_from_positive,
                 fate,
+                ..describe((j.a, j.tab), (j.b, j.mouth))
             }
         };
-        joints.par_iter().enumerate().map(describe).collect()
+        let mut rows: Vec<Candidate> = joints.par_iter().enumerate().map(refined).collect();
+        if table.pairs > LISTED_PAIRS {
+            return rows;
+        }
+        let known: std::collections::HashSet<_> = joints.iter().map(|j| (j.a, j.tab, j.b, j.mouth)).collect();
+        let judge = paper::Judge::new(&outlines);
+        for (b, o) in outlines.iter().enumerate() {
+            let windows = windows(o);
+            for (mouth, m) in o.mouths.iter().enumerate() {
+                let list = self.kept[order[b]].lists.get(mouth).map_or(&[][..], |l| &l.matches[..]);
+                for (a, other) in outlines.iter().enumerate().filter(|(a, _)| *a != b) {
+                    for (tab, t) in other.tabs.iter().enumerate() {
+                        if known.contains(&(a, tab, b, mouth)) {
+                            continue;
+                        }
+                        let rule = if self.params.policy == Policy::Paper {
+                            // What the rules let pass is among the joints, unless the budget ran out before.
+                            judge.pair((a, tab), (b, mouth)).err().unwrap_or(Rule::Support)
+                        } else if !windows.let_opening_pass(m, t) {
+                            Rule::Opening
+                        } else if !windows.let_path_pass(m, t) {
+                            Rule::PathLength
+                        } else if list.iter().any(|l| (l.hit.piece as usize, l.hit.tab as usize) == (order[a], tab)) {
+                            Rule::Placement
+                        } else {
+                            Rule::Shape
+                        };
+                        rows.push(Candidate { fate: Fate::Dropped(rule), ..describe((a, tab), (b, mouth)) });
+                    }
+                }
+            }
+        }
+        rows
     }
+}
+
+/// Outlines in the order of ranks.
+fn ranked<'a>(kept: &'a [Kept], order: &[usize]) -> Vec<&'a Outline> {
+    order.iter().filter_map(|k| kept[*k].outline.as_ref()).collect()
 }
 
 /// Whether the borders of a candidate don't follow each other at all.
@@ -452,40 +580,68 @@ fn report(order: &[usize], outlines: &[&Outline], joints: &[Joint], outcome: &Ou
     assembly
 }
 
-/// Counts of the candidate table: windows counted on sorted widths, the rest on the candidates themselves.
-fn count(outlines: &[&Outline], joints: &[Joint]) -> TableCounts {
+/// Counts of the candidate table; `near` are the pairs that the index keeps.
+fn count(outlines: &[&Outline], joints: &[Joint], near: usize) -> TableCounts {
+    let segments = |o: &'_ Outline, tabs: bool| if tabs { o.tabs.len() } else { o.mouths.len() };
+    let positive: usize = outlines.iter().map(|o| segments(o, true)).sum();
+    let negative: usize = outlines.iter().map(|o| segments(o, false)).sum();
+    let own: usize = outlines.iter().map(|o| segments(o, true) * segments(o, false)).sum();
+    let mut table = TableCounts { positive, negative, pairs: positive * negative - own, ..TableCounts::default() };
+    (table.after_opening, table.after_length) = within_windows(outlines);
+    table.after_correlation = near;
+    table.after_overlap = joints.iter().filter(|j| !hopeless(j, outlines[j.b])).count();
+    table
+}
+
+/// How many pairs pass the opening window, and how many the window of path lengths as well: counted by a sweep over the
+/// widths with a tree of sums over the path lengths (Fenwick 1994), O(n log n) in all, and the pairs within one piece
+/// taken off.
+fn within_windows(outlines: &[&Outline]) -> (usize, usize) {
     let mut tabs: Vec<(f64, f64)> = outlines.iter().flat_map(|o| o.tabs.iter().map(|t| (t.width, t.path))).collect();
     tabs.sort_by(|p, q| p.0.total_cmp(&q.0));
-    let negative: usize = outlines.iter().map(|o| o.mouths.len()).sum();
-    let same: usize = outlines.iter().map(|o| o.mouths.len() * o.tabs.len()).sum();
-    let within = |v: f64, w: (f64, f64)| v >= w.0 && v <= w.1;
-    let (after_opening, after_length) = outlines
-        .par_iter()
-        .map(|o| {
-            let w = windows(o);
-            let (mut opening, mut length) = (0, 0);
-            for m in &o.mouths {
-                let from = tabs.partition_point(|t| m.width - t.0 > w.opening.1);
-                let to = tabs.partition_point(|t| m.width - t.0 >= w.opening.0);
-                let own: Vec<&Segment> = o.tabs.iter().filter(|t| within(m.width - t.width, w.opening)).collect();
-                opening += (to - from) - own.len();
-                length += tabs[from..to].iter().filter(|t| within(m.path - t.1, w.path)).count()
-                    - own.iter().filter(|t| within(m.path - t.path, w.path)).count();
-            }
-            (opening, length)
-        })
-        .reduce(|| (0, 0), |p, q| (p.0 + q.0, p.1 + q.1));
-    let hopeless = joints.iter().filter(|j| hopeless(j, outlines[j.b])).count();
-    TableCounts {
-        positive: tabs.len(),
-        negative,
-        pairs: tabs.len() * negative - same,
-        after_opening,
-        after_length,
-        after_correlation: joints.len(),
-        after_overlap: joints.len() - hopeless,
-        backtracks: 0,
+    let mut paths: Vec<f64> = tabs.iter().map(|t| t.1).collect();
+    paths.sort_by(f64::total_cmp);
+    // Each mouth asks for the tabs before two places of the sweep: those before the second less those before the first.
+    let mut questions: Vec<(usize, bool, usize, usize)> = Vec::new();
+    let (mut opening, mut length) = (0, 0);
+    for o in outlines {
+        let w = windows(o);
+        for m in &o.mouths {
+            let own: Vec<&Segment> = o.tabs.iter().filter(|t| w.let_opening_pass(m, t)).collect();
+            let from = tabs.partition_point(|t| m.width - t.0 > w.opening.1);
+            let to = tabs.partition_point(|t| m.width - t.0 >= w.opening.0);
+            opening += to - from - own.len();
+            length -= own.iter().filter(|t| w.let_path_pass(m, t)).count() as i64;
+            let low = paths.partition_point(|p| m.path - p > w.path.1);
+            let high = paths.partition_point(|p| m.path - p >= w.path.0);
+            questions.push((from, false, low, high));
+            questions.push((to, true, low, high));
+        }
     }
+    questions.sort_unstable();
+    let mut sums = vec![0i64; paths.len() + 1];
+    let before = |sums: &[i64], mut k: usize| {
+        let mut sum = 0;
+        while k > 0 {
+            sum += sums[k];
+            k &= k - 1;
+        }
+        sum
+    };
+    let mut swept = 0;
+    for (place, add, low, high) in questions {
+        for tab in &tabs[swept..place] {
+            let mut k = paths.partition_point(|p| *p < tab.1) + 1;
+            while k < sums.len() {
+                sums[k] += 1;
+                k += k & k.wrapping_neg();
+            }
+        }
+        swept = place;
+        let inside = before(&sums, high) - before(&sums, low);
+        length += if add { inside } else { -inside };
+    }
+    (opening, length.max(0) as usize)
 }
 
 /// Candidates of a mouth that are refined in any case.
@@ -519,14 +675,15 @@ fn coarsely_best(list: &[Match], places: &[usize], scale: f64) -> Vec<usize> {
     best(list, residuals, COARSELY, scale)
 }
 
-/// Fits what has to be fitted in a mouth's list and isn't yet.
+/// Fits what has to be fitted in a mouth's list and isn't yet, and gives the places and fits that stand: refined where
+/// the coarse one is good enough. Which these are depends on the list alone, not on what was fitted while it was another.
 fn refine(
     list: &mut [Match],
     mouth: &Segment,
     outlines: &[&Outline],
     (scale, free): (f64, bool),
     feet: &mut placement::Feet,
-) {
+) -> Vec<(usize, placement::Fit)> {
     let tab = |m: &Match| &outlines[m.hit.piece as usize].tabs[m.hit.tab as usize];
     let places = roughly_best(list, scale);
     for &place in &places {
@@ -535,19 +692,13 @@ fn refine(
             m.coarse = placement::coarse(tab(m), mouth, rough, scale, free, feet);
         }
     }
-    for place in coarsely_best(list, &places, scale) {
+    let fine = coarsely_best(list, &places, scale);
+    for &place in &fine {
         let m = &mut list[place];
         if let (Some(coarse), None) = (&m.coarse, &m.fine) {
             m.fine = placement::refine(tab(m), mouth, coarse, scale, free, feet);
         }
     }
-}
-
-/// The fits of a mouth's list that stand: refined where the coarse one is good enough. Which these are depends on the
-/// list alone, not on what was fitted while it was another.
-fn best_fits(list: &[Match], scale: f64) -> Vec<(usize, placement::Fit)> {
-    let places = roughly_best(list, scale);
-    let fine = coarsely_best(list, &places, scale);
     let fit = |k: usize| if fine.contains(&k) { list[k].fine } else { list[k].coarse };
     places.into_iter().filter_map(|k| Some((k, fit(k)?))).collect()
 }
