@@ -12,7 +12,8 @@
 //!    divided by the local contrast. Pixels beyond half-way are joined to components once more: neighbours whose shadows
 //!    or glow met come apart.
 //! 4. *Rejection*, each with its [`Reason`]: cut by the frame's edge, too small beside the others, thread-like (hairs,
-//!    scanner edges), faint (glare), two shapes that touch (of about twice the usual area, with an isthmus between the halves).
+//!    scanner edges), faint (glare), two shapes that touch (of about twice the usual area, with an isthmus between the halves). Where that
+//!    isthmus is too narrow to be the neck of one of them they are cut apart instead ([`Segmentation::separated`]).
 //!
 //! # Cost
 //! Linear in the number of pixels; memory linear as well, since thread-like components are never cut out.
@@ -38,6 +39,7 @@ mod runs;
 use ground::{Blocks, Ground, median, quantile};
 use runs::{Component, Components};
 
+use crate::Point;
 use crate::contour::Border;
 use crate::isthmus::{self, Polarity};
 use crate::skeleton::Triangulation;
@@ -226,6 +228,9 @@ pub struct Segmentation {
     pub cutouts: Vec<Cutout>,
     /// What was left out, specks of less than [`MIN_REPORTED_AREA`] pixels aside, in the same order.
     pub rejected: Vec<Rejected>,
+    /// Bounding boxes of shapes that touched and were cut apart, in the same order; their border is a straight line where they
+    /// touched.
+    pub separated: Vec<Aoi>,
 }
 
 /// Specks smaller than this, in pixels, are not reported: noise and dust make any number of them.
@@ -276,6 +281,11 @@ const TOUCHING_LOBE: f64 = 0.5;
 /// Greatest width of the place where two shapes touch, as a part of the square root of the median area: the neck of a tab
 /// that reaches into the other's blank is not wider.
 const TOUCHING_WIDTH: f64 = 0.35;
+/// Greatest width of such a place at which the two are cut apart, as a part of the same: the necks of tabs are wider, and cut there the one
+/// would keep the other's tab.
+const SEPARABLE_WIDTH: f64 = 0.1;
+/// Half the width of the cut between two shapes, in pixels: pixels on either side of it are no neighbours.
+const CUT: f64 = 1.0;
 
 /// Finds the shapes of a frame.
 #[must_use]
@@ -362,7 +372,7 @@ impl Segmenter {
                 continue;
             }
             self.cut_out(frame, ground, k);
-            self.label_pixels();
+            self.crop.label(&mut self.fine);
             self.collect(frame, parameters, &mut found, &mut rejected);
         }
         sift(frame, parameters, found, rejected)
@@ -603,24 +613,6 @@ impl Segmenter {
         (quantile(&mut shape, 0.25) / QUARTILE).max(median(clear) / MEDIAN)
     }
 
-    /// Connects the pixels of `self.crop` that are beyond half-way from ground to shape.
-    fn label_pixels(&mut self) {
-        let crop = &self.crop;
-        let level = (crop.shape_level + crop.ground_level) / 2.0;
-        self.fine.clear();
-        for (y, row) in crop.pixels.chunks_exact(crop.width).enumerate() {
-            self.fine.begin_row(y);
-            if crop.shape_level > crop.ground_level {
-                let least = level.floor() as u8;
-                self.fine.add_row(0, row, |p| p > least);
-            } else {
-                let most = level.ceil() as u8;
-                self.fine.add_row(0, row, |p| p < most);
-            }
-        }
-        self.fine.close();
-    }
-
     /// Takes the components of `self.crop` over, each as a cutout, or among the rejected.
     fn collect(
         &self,
@@ -631,12 +623,7 @@ impl Segmenter {
     ) {
         let crop = &self.crop;
         for (index, c) in self.fine.list.iter().enumerate() {
-            let aoi = Aoi {
-                x: crop.x + c.left as i32,
-                y: crop.y + c.top as i32,
-                width: (c.right - c.left) as u32,
-                height: (c.bottom - c.top) as u32,
-            };
+            let aoi = crop.aoi(c);
             let box_area = aoi.width as usize * aoi.height as usize;
             let reason = if (c.area as f64) < parameters.min_fill * box_area as f64 {
                 Some(Reason::Thread)
@@ -652,7 +639,7 @@ impl Segmenter {
                 continue;
             }
             let contact = self.rim_contact(frame, index);
-            let cutout = self.cutout_of(index, c, aoi);
+            let cutout = crop.cutout(&self.fine, index);
             found.push(Found { cutout, area: c.area, contact, contrast: crop.contrast });
         }
     }
@@ -671,36 +658,93 @@ impl Segmenter {
         })
         .sum()
     }
+}
 
-    /// The part of `self.crop` round a fine component, all others made ground.
-    fn cutout_of(&self, index: usize, c: &Component, aoi: Aoi) -> Cutout {
-        let crop = &self.crop;
+impl Crop {
+    /// Connects the pixels that are beyond half-way from ground to shape.
+    fn label(&self, components: &mut Components) {
+        let level = (self.shape_level + self.ground_level) / 2.0;
+        components.clear();
+        for (y, row) in self.pixels.chunks_exact(self.width).enumerate() {
+            components.begin_row(y);
+            if self.shape_level > self.ground_level {
+                let least = level.floor() as u8;
+                components.add_row(0, row, |p| p > least);
+            } else {
+                let most = level.ceil() as u8;
+                components.add_row(0, row, |p| p < most);
+            }
+        }
+        components.close();
+    }
+
+    /// Bounding box of a component in the source frame.
+    fn aoi(&self, c: &Component) -> Aoi {
+        Aoi {
+            x: self.x + c.left as i32,
+            y: self.y + c.top as i32,
+            width: (c.right - c.left) as u32,
+            height: (c.bottom - c.top) as u32,
+        }
+    }
+
+    /// Grey level of ground.
+    fn ground_pixel(&self) -> u8 {
+        self.ground_level.round().clamp(0.0, 255.0) as u8
+    }
+
+    /// The part round a component, all others made ground.
+    fn cutout(&self, components: &Components, index: usize) -> Cutout {
+        let c = &components.list[index];
         let (left, top) = (c.left.saturating_sub(MARGIN), c.top.saturating_sub(MARGIN));
-        let (right, bottom) = (crop.width.min(c.right + MARGIN), crop.height.min(c.bottom + MARGIN));
+        let (right, bottom) =
+            (self.width.min(c.right + MARGIN), (self.pixels.len() / self.width).min(c.bottom + MARGIN));
         let width = right - left;
         let mut pixels = Vec::with_capacity(width * (bottom - top));
         for y in top..bottom {
-            pixels.extend_from_slice(&crop.pixels[y * crop.width + left..y * crop.width + right]);
+            pixels.extend_from_slice(&self.pixels[y * self.width + left..y * self.width + right]);
         }
-        let ground = crop.ground_level.round().clamp(0.0, 255.0) as u8;
-        for run in self.fine.runs.iter().filter(|r| {
-            r.label != index && self.fine.list[r.label].area >= MIN_ERASED && (top..bottom).contains(&r.row)
-        }) {
+        let ground = self.ground_pixel();
+        let is_erased = |label: usize| label != index && components.list[label].area >= MIN_ERASED;
+        for run in components.runs.iter().filter(|r| is_erased(r.label) && (top..bottom).contains(&r.row)) {
             let (start, end) = (run.start.clamp(left, right), run.end.clamp(left, right));
             pixels[(run.row - top) * width + start - left..(run.row - top) * width + end - left].fill(ground);
         }
         Cutout {
-            aoi,
+            aoi: self.aoi(c),
             window: Aoi {
-                x: crop.x + left as i32,
-                y: crop.y + top as i32,
+                x: self.x + left as i32,
+                y: self.y + top as i32,
                 width: width as u32,
                 height: (bottom - top) as u32,
             },
             pixels,
-            shape_level: crop.shape_level,
-            ground_level: crop.ground_level,
-            noise_level: crop.noise_level,
+            shape_level: self.shape_level,
+            ground_level: self.ground_level,
+            noise_level: self.noise_level,
+        }
+    }
+
+    /// Makes ground of the pixels along a line, so that what lies on either side comes apart.
+    fn cut(&mut self, [from, to]: [Point; 2]) {
+        let local = |p: Point| Point::new(p.x - f64::from(self.x), p.y - f64::from(self.y));
+        let (from, to) = (local(from), local(to));
+        let ground = self.ground_pixel();
+        let (low, high) = (from.inf(&to), from.sup(&to));
+        let rows = self.pixels.len() / self.width;
+        let range = |low: f64, high: f64, count: usize| {
+            let first = (low - CUT).floor().clamp(0.0, count as f64) as usize;
+            first..((high + CUT).ceil() + 1.0).clamp(0.0, count as f64) as usize
+        };
+        let along = to - from;
+        for y in range(low.y, high.y, rows) {
+            for x in range(low.x, high.x, self.width) {
+                let to = Point::new(x as f64, y as f64) - from;
+                let t = (to.dot(&along) / along.norm_squared().max(f64::MIN_POSITIVE)).clamp(0.0, 1.0);
+                if (to - along * t).norm() <= CUT {
+                    self.pixels[y * self.width + x] = ground;
+                }
+            }
         }
     }
 }
@@ -736,7 +780,9 @@ fn sift(frame: &Frame<'_>, parameters: &Parameters, found: Vec<Found>, mut rejec
     let median_area = if usual.len() < TOUCHING_SHAPES { usize::MAX } else { usual[(usual.len() - 1) / 2] };
     let rim = 2 * (frame.width + frame.height);
     let mut cutouts = Vec::new();
-    for f in found {
+    let mut separated = Vec::new();
+    let mut open = found;
+    while let Some(f) = open.pop() {
         let aoi = f.cutout.aoi;
         let tight = f64::from(aoi.width) >= TIGHT_SPAN * frame.width as f64
             && f64::from(aoi.height) >= TIGHT_SPAN * frame.height as f64
@@ -748,8 +794,17 @@ fn sift(frame: &Frame<'_>, parameters: &Parameters, found: Vec<Found>, mut rejec
             Some(Reason::Faint)
         } else if f.contact > 0 && !tight {
             Some(Reason::CutByFrame)
-        } else if f.area as f64 >= TOUCHING_AREA * median_area as f64 && joins_two(&f.cutout, median_area as f64) {
-            Some(Reason::Touching)
+        } else if f.area as f64 >= TOUCHING_AREA * median_area as f64
+            && let Some(contact) = contact(&f.cutout, median_area as f64)
+        {
+            let parts = part(&f, contact, median_area as f64);
+            if parts.is_empty() {
+                Some(Reason::Touching)
+            } else {
+                separated.push(aoi);
+                open.extend(parts);
+                continue;
+            }
         } else {
             None
         };
@@ -758,23 +813,59 @@ fn sift(frame: &Frame<'_>, parameters: &Parameters, found: Vec<Found>, mut rejec
             None => cutouts.push(f.cutout),
         }
     }
+    separated.sort_by_key(|aoi| (aoi.y, aoi.x));
     cutouts.sort_by_key(|c| (c.aoi.y, c.aoi.x));
     rejected.sort_by_key(|r| (r.aoi.y, r.aoi.x));
-    Segmentation { cutouts, rejected }
+    Segmentation { cutouts, rejected, separated }
 }
 
-/// Whether a shape is two of about a given area each, joined where they touch: at an isthmus that is narrow for their size.
-fn joins_two(cutout: &Cutout, area: f64) -> bool {
-    let Ok((border, noise)) = Border::from_cutout(cutout) else { return false };
-    let Ok(triangulation) = Triangulation::new(&border) else { return false };
+/// The narrowest place at which two shapes of about a given area each touch: an isthmus with most of a shape on either side.
+fn contact(cutout: &Cutout, area: f64) -> Option<[Point; 2]> {
+    let (border, noise) = Border::from_cutout(cutout).ok()?;
+    let triangulation = Triangulation::new(&border).ok()?;
     let whole = border.area();
-    isthmus::find(&border, &triangulation, noise).iter().any(|i| {
+    let joins_two = |i: &isthmus::Isthmus| {
         let count = (i.path_length / border.spacing).ceil() as usize + 1;
         let lobe = Border { points: border.sample(i.arc, 0.0, count), spacing: border.spacing }.area();
         i.polarity == Polarity::Positive
             && i.width <= TOUCHING_WIDTH * area.sqrt()
             && lobe.min(whole - lobe) >= TOUCHING_LOBE * area
-    })
+    };
+    let contacts = isthmus::find(&border, &triangulation, noise).into_iter().filter(joins_two);
+    contacts.min_by(|a, b| a.width.total_cmp(&b.width)).map(|i| i.critical_points)
+}
+
+/// Cuts a shape apart at a contact, if that is so narrow that it is no neck; the parts, none if they do not come apart.
+fn part(found: &Found, contact: [Point; 2], area: f64) -> Vec<Found> {
+    if (contact[1] - contact[0]).norm() > SEPARABLE_WIDTH * area.sqrt() {
+        return Vec::new();
+    }
+    let cutout = &found.cutout;
+    let mut crop = Crop {
+        x: cutout.window.x,
+        y: cutout.window.y,
+        width: cutout.window.width as usize,
+        pixels: cutout.pixels.clone(),
+        shape_level: cutout.shape_level,
+        ground_level: cutout.ground_level,
+        noise_level: cutout.noise_level,
+        ..Crop::default()
+    };
+    crop.cut(contact);
+    let mut components = Components::default();
+    crop.label(&mut components);
+    let large = |index: &usize| components.list[*index].area as f64 >= TOUCHING_LOBE * area;
+    let parts: Vec<usize> = (0..components.list.len()).filter(large).collect();
+    if parts.len() < 2 {
+        return Vec::new();
+    }
+    let part = |index: usize| Found {
+        cutout: crop.cutout(&components, index),
+        area: components.list[index].area,
+        contact: 0,
+        contrast: found.contrast,
+    };
+    parts.into_iter().map(part).collect()
 }
 
 /// The depth from which on blocks of a shape have its own level, the blur of its edge being left behind: the first whose median

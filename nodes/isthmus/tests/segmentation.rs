@@ -150,27 +150,41 @@ fn a_piece_that_the_frame_cuts_is_named() {
     assert_eq!(found.rejected.iter().map(|r| r.reason).collect::<Vec<_>>(), [Reason::CutByFrame]);
 }
 
+/// A frame of four pieces two of which are `gap` pixels apart: the tab of the left one points at the flat side of the right one.
+fn touching(gap: f64) -> (Segmentation, Vec<Neck>) {
+    let usual = Piece::usual(SIZE);
+    let mut left = Piece { sides: [None; 4], ..usual.clone() };
+    left.sides[1] = usual.sides[0];
+    let right = Piece { sides: [usual.sides[0], usual.sides[1], None, None], ..usual.clone() };
+    let tab = left.sides[1].unwrap().1;
+    let reach = SIZE + tab.height + tab.head + gap;
+    let single = Piece::random(SIZE, 3);
+    let lying = [
+        (&left, pose(0.0, 1.0, 200.0, 250.0)),
+        (&right, pose(0.0, 1.0, 200.0 + reach, 250.0)),
+        (&single, pose(0.4, 1.0, 230.0, 680.0)),
+        (&single, pose(1.4, 1.0, 640.0, 680.0)),
+    ];
+    let outlines: Vec<_> = lying.iter().map(|(piece, pose)| piece.outline(pose)).collect();
+    let camera = Camera { width: SIDE, height: SIDE, noise: 3.0, ..Camera::default() };
+    (grey(&camera.picture(&outlines)), lying.iter().flat_map(|(piece, pose)| piece.necks(pose)).collect())
+}
+
 #[test]
-fn two_pieces_that_touch_are_named() {
-    let mut reasons = Vec::new();
-    for gap in [40.0, -3.0, -8.0] {
-        // The tab of the left one points at the flat side of the right one.
-        let usual = Piece::usual(SIZE);
-        let mut left = Piece { sides: [None; 4], ..usual.clone() };
-        left.sides[1] = usual.sides[0];
-        let right = Piece { sides: [usual.sides[0], usual.sides[1], None, None], ..usual.clone() };
-        let tab = left.sides[1].unwrap().1;
-        let reach = SIZE + tab.height + tab.head + gap;
-        let single = Piece::random(SIZE, 3);
-        let outlines = [
-            left.outline(&pose(0.0, 1.0, 200.0, 250.0)),
-            right.outline(&pose(0.0, 1.0, 200.0 + reach, 250.0)),
-            single.outline(&pose(0.4, 1.0, 230.0, 680.0)),
-            single.outline(&pose(1.4, 1.0, 640.0, 680.0)),
-        ];
-        let camera = Camera { width: SIDE, height: SIDE, noise: 3.0, ..Camera::default() };
-        let found = grey(&camera.picture(&outlines));
-        reasons.push((found.cutouts.len(), found.rejected.iter().map(|r| r.reason).collect::<Vec<_>>()));
+fn two_pieces_that_barely_touch_are_cut_apart() {
+    for (gap, separated) in [(40.0, 0), (0.0, 1), (-0.5, 1)] {
+        let (found, necks) = touching(gap);
+        check(&found, &necks, &format!("gap {gap}"));
+        assert_eq!((found.separated.len(), found.rejected.len()), (separated, 0), "gap {gap}: {:?}", found.rejected);
     }
-    assert_eq!(reasons, [(4, vec![]), (2, vec![Reason::Touching]), (2, vec![Reason::Touching])]);
+}
+
+#[test]
+fn two_pieces_that_overlap_are_named() {
+    for gap in [-3.0, -8.0] {
+        let (found, _) = touching(gap);
+        assert_eq!(found.cutouts.len(), 2, "gap {gap}");
+        assert_eq!(found.rejected.iter().map(|r| r.reason).collect::<Vec<_>>(), [Reason::Touching], "gap {gap}");
+        assert_eq!(found.separated, []);
+    }
 }
