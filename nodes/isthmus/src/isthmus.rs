@@ -69,6 +69,9 @@ const SALIENT_NECK_PERSISTENCE: f64 = 0.12;
 /// Most area beyond a salient neck, as a part of the shape's: a lobe, not a limb of the body (tabs of real pieces have up to
 /// a tenth, the corner between two blanks more).
 const SALIENT_NECK_AREA: f64 = 0.13;
+/// Least area beyond a salient neck or behind a salient mouth, as a part of the shape's: tabs have a hundredth and more, frayed edges and
+/// dents less.
+const SALIENT_AREA: f64 = 0.004;
 /// Greatest width of a salient neck, as a part of the square root of the shape's area.
 const SALIENT_NECK_WIDTH: f64 = 0.32;
 /// Least persistence of a salient mouth, as a part of its width. There are few pockets that are no blanks.
@@ -221,16 +224,18 @@ fn isthmus_at(
     if !(width > 0.0 && path_length > width) {
         return None;
     }
-    let salient = match polarity {
-        Polarity::Positive => {
-            persistence >= SALIENT_NECK_PERSISTENCE * width
-                && lobe.abs() <= SALIENT_NECK_AREA * area
-                && width <= SALIENT_NECK_WIDTH * area.sqrt()
-        }
-        Polarity::Negative => {
-            persistence >= SALIENT_MOUTH_PERSISTENCE * width && lobe.abs() <= SALIENT_MOUTH_AREA * area
-        }
-    };
+    let is_large = lobe.abs() >= SALIENT_AREA * area;
+    let salient = is_large
+        && match polarity {
+            Polarity::Positive => {
+                persistence >= SALIENT_NECK_PERSISTENCE * width
+                    && lobe.abs() <= SALIENT_NECK_AREA * area
+                    && width <= SALIENT_NECK_WIDTH * area.sqrt()
+            }
+            Polarity::Negative => {
+                persistence >= SALIENT_MOUTH_PERSISTENCE * width && lobe.abs() <= SALIENT_MOUTH_AREA * area
+            }
+        };
     Some(Isthmus {
         polarity,
         point: nalgebra::center(&p, &q),
