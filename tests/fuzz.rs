@@ -72,6 +72,14 @@ fn run(target: &Target, input: &[u8], what: &str) {
     assert!(start.elapsed() < PATIENCE, "{}: {what} took {:?}", target.name, start.elapsed());
 }
 
+/// For the engine, which begins with them.
+fn write_seeds(folder: &Path, seeds: &[Vec<u8>]) {
+    std::fs::create_dir_all(folder).unwrap();
+    for (number, seed) in seeds.iter().enumerate() {
+        std::fs::write(folder.join(format!("seed_{number}")), seed).unwrap();
+    }
+}
+
 #[test]
 fn damaged_input_gives_errors_and_neither_panics_nor_hangs() {
     let (_, hard) = getrlimit(Resource::RLIMIT_AS).unwrap();
@@ -79,6 +87,9 @@ fn damaged_input_gives_errors_and_neither_panics_nor_hangs() {
     for target in TARGETS {
         let seeds = (target.seeds)();
         assert!(!seeds.is_empty() && seeds.iter().all(|seed| !seed.is_empty()), "{} has no seeds", target.name);
+        if let Some(corpus) = std::env::var_os("JIGSAW_FUZZ_CORPUS") {
+            write_seeds(&Path::new(&corpus).join(target.name), &seeds);
+        }
         let mut random = ChaCha8Rng::seed_from_u64(1990);
         for (k, seed) in seeds.iter().enumerate() {
             run(target, seed, &format!("seed {k}"));
