@@ -19,6 +19,7 @@ ARGUMENTS = {
     "source": ("", "folder of pictures to take instead of the camera"),
     "metres_per_pixel": ("0.0001", "scale of the pictures on the table [m/px]"),
     "policy": ("standard", "rules of the assembly: standard or paper"),
+    "journal": ("", "folder for the pieces that the solver node has taken in, so that they outlast it"),
     "use_sim_time": ("false", "take the time from /clock"),
 }
 
@@ -54,6 +55,12 @@ def generate_launch_description():
                 [("image", image), ("image/compressed", [image, "/compressed"])],
             ),
             node("feature_node"),
-            node("solver_node", {"policy": ParameterValue(LaunchConfiguration("policy"), value_type=str)}),
+            node(
+                "solver_node",
+                {
+                    "policy": ParameterValue(LaunchConfiguration("policy"), value_type=str),
+                    "journal": ParameterValue(LaunchConfiguration("journal"), value_type=str),
+                },
+            ),
         ]
     )

@@ -114,7 +114,7 @@ fn run_solver_with_goals(
     let (transform, transforms) = mpsc::channel(room);
     let (marker, markers) = mpsc::channel(room);
     let (solutions, _) = mpsc::unbounded();
-    let outputs = solver::Outputs { assembly, transforms: transform, markers: marker, solutions };
+    let outputs = solver::Outputs { assembly, transforms: transform, markers: marker, solutions, journal: None };
     let settings = solver::Settings {
         parameters: parameters(solver::params::PARAMETERS),
         health: Arc::clone(health),

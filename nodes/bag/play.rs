@@ -10,6 +10,9 @@
 //!   the node's own history: one that keeps `n` samples and falls `n` behind loses some, as with any publisher. A reliable
 //!   subscription with a deeper history, or a rate, helps there.
 //! - Before the first message, every topic that is played must have a subscription.
+//!
+//! At a rate, a publisher does not wait for acknowledgements, as a camera does not: a subscription that has died (its
+//! participant counts as alive for another 50 s) holds up neither the bag nor the other subscriptions.
 
 use std::collections::HashMap;
 use std::sync::Arc;
@@ -44,6 +47,13 @@ const STALL: Duration = Duration::from_secs(5);
 
 /// How long publishers stay after the last message for what is still under way to best-effort subscriptions.
 const LINGER: Duration = Duration::from_millis(300);
+
+/// Bytes that wait, at a rate, for the acknowledgement of a subscription that may have died; when they are full, the
+/// publisher waits too.
+const BACKLOG_BYTES: usize = 256 << 20;
+
+/// Messages that wait so, however small they are.
+const BACKLOG_MESSAGES: usize = 4096;
 
 /// Nanoseconds in a second.
 const NANOSECONDS: i64 = 1_000_000_000;
@@ -256,9 +266,14 @@ fn open(
         }
         // The byte order of a publisher is fixed; all messages of a topic have that of the machine that sent them.
         let first = bag.messages(Selection::topics([topic.name.as_str()]))?.next();
-        let big_endian = matches!(first, Some(Ok(m)) if matches!(cdr::split_header(&m.cdr), Ok((ByteOrder::Big, _))));
-        let publisher =
-            session.publish_raw(&topic.name, &topic.type_name, offered(&topic.offered_qos, lossless), big_endian)?;
+        let big_endian = matches!(&first, Some(Ok(m)) if matches!(cdr::split_header(&m.cdr), Ok((ByteOrder::Big, _))));
+        let unacknowledged = match &first {
+            _ if lossless => 1,
+            Some(Ok(message)) => (BACKLOG_BYTES / message.cdr.len().max(1)).clamp(1, BACKLOG_MESSAGES),
+            _ => BACKLOG_MESSAGES,
+        };
+        let qos = offered(&topic.offered_qos, lossless);
+        let publisher = session.publish_raw(&topic.name, &topic.type_name, qos, unacknowledged, big_endian)?;
         publishers.insert(topic.name.clone(), publisher);
     }
     Ok(publishers)

@@ -2,13 +2,9 @@
 
 use std::process::ExitCode;
 
-use jigsaw_nodes::feature::{PROGRAM, open};
-use jigsaw_nodes::ros::{process, topics};
+use jigsaw_nodes::feature::{PROGRAM, open_with_topics};
+use jigsaw_nodes::ros::process;
 
 fn main() -> ExitCode {
-    process::main(PROGRAM, |mut session| {
-        let pieces = session.subscribe(&topics::PIECE_IMAGE)?;
-        let (features, _) = session.publish(&topics::PIECE_FEATURES)?;
-        open(session, pieces, features)
-    })
+    process::main(PROGRAM, open_with_topics)
 }

@@ -2,6 +2,7 @@
 
 pub mod convert;
 pub mod params;
+pub mod share;
 
 use std::sync::Arc;
 
@@ -17,7 +18,7 @@ use crate::ros::health::Health;
 use crate::ros::lifecycle::{Activity, Forget, WhileInactive};
 use crate::ros::params::Parameters;
 use crate::ros::process::{ProcessError, Program, Work};
-use crate::ros::session::{Audience, Session};
+use crate::ros::session::{Audience, CHANNEL_DEPTH, Session};
 use crate::ros::topics;
 use convert::PieceImageError;
 
@@ -57,6 +58,24 @@ pub struct Settings {
     pub health: Arc<Health>,
     /// Whether the node works.
     pub activity: Activity,
+}
+
+/// Opens the node with its own topics, sharing the pieces with other feature nodes if it is told to, and gives its loop.
+///
+/// # Errors
+/// As for [`open`].
+pub fn open_with_topics(mut session: Session) -> Result<Work, ProcessError> {
+    let pieces = session.subscribe(&topics::PIECE_IMAGE)?;
+    let (features, audience) = session.publish(&topics::PIECE_FEATURES)?;
+    if !session.parameters.bool(&params::SHARE) {
+        return open(session, pieces, features);
+    }
+    let heard = session.subscribe_with_writer(&topics::PIECE_FEATURES)?;
+    let others = session.writers_of(&topics::PIECE_FEATURES)?;
+    let (work, mine) = mpsc::channel(CHANNEL_DEPTH);
+    let streams = share::Streams { pieces, heard, work, results: features.clone() };
+    session.spawn(share::run(share::Share::new(audience.writer()), streams, others));
+    open(session, mine, features)
 }
 
 /// Opens the node and gives its loop.

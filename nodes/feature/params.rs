@@ -12,5 +12,16 @@ pub const THREADS: Spec = Spec {
     read_only: true,
 };
 
+/// Whether there are others to share the work with.
+pub const SHARE: Spec = Spec {
+    name: "share",
+    default: Default::Bool(false),
+    unit: "",
+    rule: Rule::Any,
+    description: "Share the pieces with the other feature nodes that publish on the same topic; where one does not \
+                  answer within 1 s, another takes its pieces over. To be set on all of them.",
+    read_only: true,
+};
+
 /// All of them.
-pub const PARAMETERS: &[Spec] = &[THREADS];
+pub const PARAMETERS: &[Spec] = &[THREADS, SHARE];

@@ -11,6 +11,7 @@
 //! | [`topics`] | every topic: message type, name, quality of service |
 //! | [`raw`] | topics whose type is known by name only |
 //! | [`session`] | one node: opens topics and services as streams and sinks |
+//! | [`peers`] | discovery without multicast |
 //! | [`process`] | one process: signals, participant, watchdog, exit code |
 //! | [`logging`] | log lines to the console and `/rosout`, throttled warnings |
 //! | [`health`] | counters of a node, published as `/diagnostics` |
@@ -22,6 +23,7 @@ pub mod health;
 pub mod lifecycle;
 pub mod logging;
 pub mod params;
+pub mod peers;
 pub mod process;
 pub mod raw;
 mod server;

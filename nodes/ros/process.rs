@@ -12,7 +12,7 @@
 //! SIGCONT interrupt polls all the same; so a **watchdog** looks whether RustDDS's threads still live and ends the
 //! process where one has gone, so that whoever started it starts it again.
 
-use std::net::IpAddr;
+use std::net::{IpAddr, Ipv4Addr};
 use std::process::ExitCode;
 use std::rc::Rc;
 use std::sync::Arc;
@@ -27,14 +27,14 @@ use nix::sys::resource::{Resource, getrlimit, setrlimit};
 use nix::sys::signal::{SigSet, Signal};
 use ros2_client::{Context, NodeName, NodeOptions};
 use rustdds::dds::statusevents::{DomainParticipantStatusEvent, StatusEvented};
-use rustdds::{DomainParticipant, DomainParticipantBuilder};
+use rustdds::{DomainParticipant, DomainParticipantBuilder, RTPSEntity};
 
 use super::args::{ArgsError, RosArgs, domain_id};
 use super::health::Health;
 use super::lifecycle::{AUTOSTART, Activity};
 use super::params::{Default as DefaultValue, ParameterError, Parameters, Rule, Spec};
 use super::session::{Clock, Endpoints, Session, SessionError};
-use super::{logging, services, topics};
+use super::{logging, peers, services, topics};
 
 /// Whether the time comes from `/clock`.
 pub const USE_SIM_TIME: Spec = Spec {
@@ -67,8 +67,19 @@ pub const MAXIMUM_MEMORY: Spec = Spec {
     read_only: true,
 };
 
+/// Hosts that multicast does not reach.
+pub const STATIC_PEERS: Spec = Spec {
+    name: "static_peers",
+    default: DefaultValue::Texts(&[]),
+    unit: "",
+    rule: Rule::Texts("IPv4 addresses", |text| text.parse::<Ipv4Addr>().is_ok()),
+    description: "Addresses of hosts that this process announces itself to by unicast, for networks without multicast; \
+                  to be set on all hosts. Without, the environment's ROS_STATIC_PEERS is taken (separated by ';').",
+    read_only: true,
+};
+
 /// The parameters every node has.
-pub const COMMON_PARAMETERS: &[Spec] = &[AUTOSTART, USE_SIM_TIME, NETWORK_INTERFACES, MAXIMUM_MEMORY];
+pub const COMMON_PARAMETERS: &[Spec] = &[AUTOSTART, USE_SIM_TIME, NETWORK_INTERFACES, MAXIMUM_MEMORY, STATIC_PEERS];
 
 /// How often the watchdog looks.
 const WATCH_PERIOD: Duration = Duration::from_millis(500);
@@ -330,9 +341,18 @@ impl Process {
         let addresses = interfaces(parameters, |variable| std::env::var(variable).ok())?;
         if !addresses.is_empty() {
             log::debug!("network interfaces: {addresses:?}");
-            builder = builder.with_only_networks(addresses);
+            builder = builder.with_only_networks(addresses.iter().copied());
         }
+        let peers = static_peers(parameters, std::env::var("ROS_STATIC_PEERS").ok())?;
+        let system = |e: std::io::Error| ProcessError::System { what: "listening to discovery", reason: e.to_string() };
+        // Opened before the participant, so that its first announcement is heard.
+        let courier =
+            if peers.is_empty() { None } else { Some(peers::Courier::open(domain, &addresses).map_err(system)?) };
         let participant = builder.build().map_err(|e| SessionError::middleware(format!("DDS domain {domain}"), e))?;
+        if let Some(courier) = courier {
+            log::debug!("static peers: {peers:?}");
+            courier.serve(participant.guid(), peers).map_err(system)?;
+        }
         let context = Context::from_domain_participant(participant.clone())
             .map_err(|e| SessionError::middleware(format!("DDS domain {domain}"), e))?;
         self.participant = Some((participant, context.clone()));
@@ -380,6 +400,25 @@ fn interfaces(
             rule: "must be one of SUBNET, LOCALHOST, OFF, SYSTEM_DEFAULT",
         }),
     }
+}
+
+/// The hosts to announce this process to, of the parameter or the environment.
+fn static_peers(parameters: &Parameters, environment: Option<String>) -> Result<Vec<Ipv4Addr>, ArgsError> {
+    let given: Vec<Ipv4Addr> = parameters.texts(&STATIC_PEERS).iter().filter_map(|text| text.parse().ok()).collect();
+    if !given.is_empty() {
+        return Ok(given);
+    }
+    let texts = environment.unwrap_or_default();
+    let texts = texts.split(';').map(str::trim).filter(|text| !text.is_empty());
+    texts
+        .map(|text| {
+            text.parse().map_err(|_| ArgsError::Environment {
+                variable: "ROS_STATIC_PEERS",
+                value: text.to_owned(),
+                rule: "must be IPv4 addresses, separated by ';'",
+            })
+        })
+        .collect()
 }
 
 /// Keeps the session's clock at `/clock` while `use_sim_time` is set.
@@ -442,6 +481,9 @@ async fn follow_discovery(participant: DomainParticipant, endpoints: Endpoints) 
                 endpoints.matched(local_writer, remote_reader);
             }
             DomainParticipantStatusEvent::ReaderLost { guid, .. } => endpoints.lost(guid),
+            DomainParticipantStatusEvent::ParticipantLost { id, .. } => {
+                endpoints.lost_all(|reader| reader.prefix == id)
+            }
             DomainParticipantStatusEvent::RemoteReaderQosIncompatible {
                 local_writer: local,
                 requested_qos,

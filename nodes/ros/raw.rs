@@ -160,7 +160,8 @@ enum Writer {
 }
 
 impl Session {
-    /// A publisher of messages of a type known by name. The topic's name is remapped as any other.
+    /// A publisher of messages of a type known by name. The topic's name is remapped as any other. `unacknowledged` is
+    /// how many messages may be under way to reliable volatile subscriptions.
     ///
     /// # Errors
     /// [`SessionError`] for a name or type that ROS does not allow, or where the middleware refuses.
@@ -169,17 +170,19 @@ impl Session {
         topic: &str,
         type_name: &str,
         qos: RawQos,
+        unacknowledged: usize,
         big_endian: bool,
     ) -> Result<RawPublisher, SessionError> {
         let name = self.names.topic(topic)?;
         let fail = |e: rustdds::dds::CreateError| SessionError::middleware(format!("publisher of {name}"), e);
         let mut policies = qos.policies();
         if qos.reliable && !qos.transient_local {
-            // One sample under way: the writer itself makes the next one wait until it was acknowledged.
+            // The writer itself makes a further sample wait until one was acknowledged.
+            let most = i32::try_from(unacknowledged).unwrap_or(i32::MAX);
             policies = policies.resource_limits(ResourceLimits {
-                max_samples: 1,
-                max_instances: 1,
-                max_samples_per_instance: 1,
+                max_samples: most,
+                max_instances: most,
+                max_samples_per_instance: most,
             });
         }
         let policies = policies.build();
@@ -323,8 +326,7 @@ impl RawPublisher {
         &self.audience
     }
 
-    /// Sends a message once the one before it was sent and, where a subscription is reliable and volatile, acknowledged;
-    /// so at most one message waits in this publisher and one in the sockets.
+    /// Sends a message, once few enough are under way to reliable volatile subscriptions (see [`Session::publish_raw`]).
     ///
     /// # Errors
     /// The middleware refuses.

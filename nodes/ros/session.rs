@@ -12,8 +12,8 @@ use futures::channel::{mpsc, oneshot};
 use futures::{SinkExt, StreamExt};
 use jigsaw_msgs::builtin_interfaces::msg::Time;
 use jigsaw_msgs::{Message, Service};
-use ros2_client::{Context, MessageTypeName, Name, Node};
-use rustdds::GUID;
+use ros2_client::{Context, MessageInfo, MessageTypeName, Name, Node};
+use rustdds::{GUID, RTPSEntity};
 
 use super::args::{ArgsError, NodeNames};
 use super::health::Health;
@@ -88,6 +88,11 @@ impl Endpoints {
         });
     }
 
+    /// All readers for which this holds are lost, as those of a participant that has died without a word.
+    pub(super) fn lost_all(&self, lost: impl Fn(&GUID) -> bool) {
+        self.with(|table| table.readers_of.values_mut().for_each(|readers| readers.retain(|reader| !lost(reader))));
+    }
+
     /// The name of the topic of an endpoint of this process.
     pub(super) fn name(&self, endpoint: GUID) -> Option<String> {
         self.with(|table| table.names.get(&endpoint).cloned())
@@ -102,6 +107,11 @@ pub struct Audience {
 }
 
 impl Audience {
+    /// The writer that is listened to.
+    pub fn writer(&self) -> GUID {
+        self.writer
+    }
+
     /// How many subscriptions there are.
     pub fn count(&self) -> usize {
         self.endpoints.with(|table| table.readers_of.get(&self.writer).map_or(0, HashSet::len))
@@ -171,6 +181,25 @@ impl Session {
     /// # Errors
     /// [`SessionError`] for a bad name, or where the middleware refuses.
     pub fn subscribe<M: Message>(&mut self, topic: &Topic<M>) -> Result<mpsc::Receiver<M>, SessionError> {
+        self.subscribe_as(topic, |message, _| message)
+    }
+
+    /// The messages of a topic, and which writer each is from.
+    ///
+    /// # Errors
+    /// As for [`Self::subscribe`].
+    pub fn subscribe_with_writer<M: Message>(
+        &mut self,
+        topic: &Topic<M>,
+    ) -> Result<mpsc::Receiver<(M, GUID)>, SessionError> {
+        self.subscribe_as(topic, |message, info| (message, GUID::from(info.publisher_gid())))
+    }
+
+    fn subscribe_as<M: Message, T: 'static>(
+        &mut self,
+        topic: &Topic<M>,
+        make: impl Fn(M, MessageInfo) -> T + 'static,
+    ) -> Result<mpsc::Receiver<T>, SessionError> {
         let (name, dds_topic) = self.dds_topic(topic)?;
         let subscription = self
             .node
@@ -183,8 +212,8 @@ impl Session {
             let mut messages = Box::pin(subscription.async_stream());
             while let Some(message) = messages.next().await {
                 match message {
-                    Ok((message, _)) => {
-                        if sender.send(message).await.is_err() {
+                    Ok((message, info)) => {
+                        if sender.send(make(message, info)).await.is_err() {
                             break;
                         }
                     }
@@ -234,6 +263,24 @@ impl Session {
     pub(super) fn audience_of(&self, writer: GUID, name: &str) -> Audience {
         self.endpoints.opened(writer, name);
         Audience { endpoints: self.endpoints.clone(), writer }
+    }
+
+    /// Gives the writers of a topic in other processes, as discovery knows them at the time of the call.
+    ///
+    /// # Errors
+    /// A bad name.
+    pub fn writers_of<M>(&self, topic: &Topic<M>) -> Result<impl Fn() -> Vec<GUID> + use<M>, SessionError> {
+        let name = format!("rt{}", self.names.topic(topic.name)?);
+        let participant = self.context.domain_participant().clone();
+        let own = participant.guid().prefix;
+        Ok(move || {
+            let writers = participant.discovered_writers().into_iter();
+            writers
+                .filter(|writer| writer.publication_topic_data.topic_name == name)
+                .map(|writer| writer.writer_proxy.remote_writer_guid)
+                .filter(|writer| writer.prefix != own)
+                .collect()
+        })
     }
 
     fn dds_topic<M: Message>(&self, topic: &Topic<M>) -> Result<(String, rustdds::Topic), SessionError> {

@@ -4,6 +4,7 @@
 //! worker thread; pieces that come meanwhile are taken in after it. Every solution is published, also a partial one.
 
 pub mod convert;
+pub mod journal;
 pub mod params;
 
 use std::collections::HashMap;
@@ -30,6 +31,7 @@ use crate::ros::process::{ProcessError, Program, Work};
 use crate::ros::session::{Call, Session};
 use crate::ros::topics;
 use convert::{FeaturesError, Naming, Sighting, Solution};
+use journal::{Journal, JournalError};
 
 /// The program of this node.
 pub const PROGRAM: Program = Program {
@@ -57,6 +59,8 @@ pub struct Outputs {
     pub markers: mpsc::Sender<MarkerArray>,
     /// What is to be drawn; [`draw`] takes it from there.
     pub solutions: mpsc::UnboundedSender<Arc<Solution>>,
+    /// Where the pieces taken in are kept, if anywhere.
+    pub journal: Option<Journal>,
 }
 
 /// How often is looked whether someone has begun to listen to the pictures.
@@ -100,6 +104,10 @@ pub fn open(
     mut session: Session,
     features: impl Stream<Item = PieceFeatures> + Unpin + 'static,
 ) -> Result<Work, ProcessError> {
+    let journal = params::journal_folder(&session.parameters)
+        .map(|folder| Journal::open(&folder))
+        .transpose()
+        .map_err(|e| ProcessError::Configuration(format!("parameter '{}': {e}", params::JOURNAL.name)))?;
     let resets = session.serve::<Trigger>(topics::RESET_SERVICE)?;
     let solves = session.serve::<Trigger>(topics::SOLVE_SERVICE)?;
     // Drawing never holds up solving.
@@ -114,6 +122,7 @@ pub fn open(
         transforms: session.publish(&topics::TF_STATIC)?.0,
         markers: session.publish(&topics::ASSEMBLY_MARKERS)?.0,
         solutions: to_draw,
+        journal,
     };
     let (images, audience) = session.publish(&topics::ASSEMBLY_IMAGE)?;
     session.spawn(draw(solutions, images, move || audience.count() > 0));
@@ -155,7 +164,7 @@ pub struct Settings {
     pub activity: Activity,
 }
 
-/// The node's loop. Ends, after a last solution, when shapes and requests have ended.
+/// The node's loop. Begins with the pieces of the journal. Ends, after a last solution, when shapes and requests have ended.
 pub async fn run(
     features: impl Stream<Item = PieceFeatures> + Unpin,
     requests: Requests<
@@ -170,6 +179,7 @@ pub async fn run(
     let mut changes = settings.parameters.changes();
     let mut switches = settings.activity.changes();
     let mut table = Table::new(outputs, settings);
+    table.recall();
     let mut features = features.fuse();
     let (mut resets, mut solves, mut goals) = (requests.resets.fuse(), requests.solves.fuse(), requests.goals.fuse());
     let mut forgets = requests.forgets.fuse();
@@ -351,14 +361,39 @@ impl Table {
         }
     }
 
+    /// Takes in the pieces that the journal has kept.
+    fn recall(&mut self) {
+        let Some(journal) = self.outputs.journal.clone() else { return };
+        match journal.pieces() {
+            Ok((pieces, faults)) => {
+                if !pieces.is_empty() {
+                    log::info!("{} pieces were kept in the journal", pieces.len());
+                }
+                faults.iter().for_each(|fault| self.health.refuse("journal", &fault.to_string()));
+                pieces.iter().for_each(|piece| self.take(piece));
+            }
+            Err(fault) => self.health.warn("journal", &fault.to_string()),
+        }
+    }
+
+    /// Does something to the journal, if there is one. Where that fails the node works on without.
+    fn keep_journal(&self, action: impl FnOnce(&Journal) -> Result<(), JournalError>) {
+        if let Some(Err(fault)) = self.outputs.journal.as_ref().map(action) {
+            self.health.warn("journal", &fault.to_string());
+        }
+    }
+
     /// Takes a piece in, or refuses it.
     fn take(&mut self, message: &PieceFeatures) {
         match self.admit(message) {
             Ok(true) => {
+                self.keep_journal(|journal| journal.keep(message));
                 self.health.received();
                 self.health.figure("pieces", self.sightings.len());
                 let settle_time = Duration::from_secs_f64(self.parameters.double(&params::SETTLE_TIME));
-                self.due = Some(Instant::now() + settle_time);
+                // With the last piece there is nothing to wait for.
+                let is_last = self.sightings.len() == self.expected_pieces();
+                self.due = Some(Instant::now() + if is_last { Duration::ZERO } else { settle_time });
             }
             Ok(false) => log::debug!("piece {} came again", message.id),
             Err(refusal) => self.health.refuse(refusal.kind(), &refusal.to_string()),
@@ -431,6 +466,7 @@ impl Table {
         }
         for (id, reason) in done.refused {
             self.sightings.remove(&id);
+            self.keep_journal(|journal| journal.forget(&id));
             let refusal = FeaturesError::Solver(reason);
             self.health.refuse(refusal.kind(), &refusal.to_string());
         }
@@ -460,10 +496,15 @@ impl Table {
         Naming {
             table_frame: self.parameters.text(&params::TABLE_FRAME),
             puzzle_frame: self.parameters.text(&params::PUZZLE_FRAME),
-            expected_pieces: match &self.goal {
-                Some(goal) if goal.expected_pieces > 0 => goal.expected_pieces,
-                _ => params::count(&self.parameters, &params::EXPECTED_PIECES),
-            },
+            expected_pieces: self.expected_pieces(),
+        }
+    }
+
+    /// Pieces of the whole puzzle, by the goal or the parameter; 0 if not known.
+    fn expected_pieces(&self) -> usize {
+        match &self.goal {
+            Some(goal) if goal.expected_pieces > 0 => goal.expected_pieces,
+            _ => params::count(&self.parameters, &params::EXPECTED_PIECES),
         }
     }
 
@@ -516,6 +557,7 @@ impl Table {
         self.due = None;
         self.transforms = TFMessage::default();
         self.solver = None;
+        self.keep_journal(Journal::forget_all);
         self.health.figure("pieces", 0);
     }
 }

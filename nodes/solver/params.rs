@@ -1,5 +1,7 @@
 //! Parameters of the solver node.
 
+use std::path::PathBuf;
+
 use jigsaw::{Params, Policy};
 
 use crate::ros::params::{Default, Parameters, Rule, Spec};
@@ -105,6 +107,17 @@ pub const PUZZLE_FRAME: Spec = Spec {
     read_only: true,
 };
 
+/// Where pieces are kept.
+pub const JOURNAL: Spec = Spec {
+    name: "journal",
+    default: Default::Text(""),
+    unit: "",
+    rule: Rule::Any,
+    description: "Folder in which the pieces taken in are kept, one file each, so that they outlast this process; a \
+                  reset empties it. Without one, what the feature node still holds is taken.",
+    read_only: true,
+};
+
 /// A hundred times the largest common puzzle; beyond it a number is a slip of the pen.
 const MOST_PIECES: i64 = 100_000;
 
@@ -120,6 +133,7 @@ pub const PARAMETERS: &[Spec] = &[
     SETTLE_TIME,
     TABLE_FRAME,
     PUZZLE_FRAME,
+    JOURNAL,
 ];
 
 fn is_frame_name(text: &str) -> bool {
@@ -136,6 +150,11 @@ pub fn solver_params(parameters: &Parameters) -> Params {
         threads: count(parameters, &THREADS),
         ..Params::default()
     }
+}
+
+/// The folder of the journal, if there is one.
+pub fn journal_folder(parameters: &Parameters) -> Option<PathBuf> {
+    Some(parameters.text(&JOURNAL)).filter(|text| !text.is_empty()).map(PathBuf::from)
 }
 
 /// The value of a whole number that the table keeps from being negative.
