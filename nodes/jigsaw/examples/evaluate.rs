@@ -7,7 +7,7 @@
 use anyhow::{Context, bail};
 use isthmus::{Point, mask};
 use jigsaw::generate::{Cut, Options, Puzzle, Rim};
-use jigsaw::{Assembly, Params, Piece, Policy, Solver};
+use jigsaw::{Assembly, Fate, Params, Piece, Policy, Solver};
 use nalgebra::Vector2;
 use rayon::prelude::*;
 use std::time::Instant;
@@ -92,6 +92,40 @@ fn centroid(piece: &Piece) -> Point {
     Point::from(points.iter().fold(Vector2::zeros(), |s, p| s + p.coords) / points.len() as f64)
 }
 
+/// Prints the joints that were not found: their candidate and what became of it.
+fn missed(puzzle: &Puzzle, pieces: &[Piece], solver: &Solver) {
+    let truth = puzzle.truth("png");
+    let candidates = solver.candidates();
+    // The isthmus of a piece at the neck of a joint: its midpoint is nearest.
+    let isthmus = |id: &str, joint: usize| {
+        let side = truth.pieces.iter().find(|p| p.id == id)?.sides.iter().find(|s| s.joint == joint)?;
+        let [a, b] = side.critical_points?;
+        let middle = Point::new(0.5 * (a[0] + b[0]), 0.5 * (a[1] + b[1]));
+        let piece = pieces.iter().position(|p| p.id == id)?;
+        let distance = |k: &usize| (pieces[piece].features.isthmuses[*k].point - middle).norm();
+        let all = 0..pieces[piece].features.isthmuses.len();
+        Some((piece, all.min_by(|p, q| distance(p).total_cmp(&distance(q)))?))
+    };
+    for joint in &truth.joints {
+        let (Some(tab), Some(mouth)) = (isthmus(&joint.positive, joint.joint), isthmus(&joint.negative, joint.joint))
+        else {
+            println!("  {} in {}: no isthmus", joint.positive, joint.negative);
+            continue;
+        };
+        let known = candidates
+            .iter()
+            .find(|c| (c.positive_piece, c.positive_isthmus) == tab && (c.negative_piece, c.negative_isthmus) == mouth);
+        match known {
+            Some(c) if c.fate == Fate::Mated => {}
+            Some(c) => println!(
+                "  {} in {}: {:?}, {:.3?}, shape {:.3}, {} loops",
+                joint.positive, joint.negative, c.fate, c.posed, c.shape_distance, c.support
+            ),
+            None => println!("  {} in {}: no candidate", joint.positive, joint.negative),
+        }
+    }
+}
+
 fn main() -> anyhow::Result<()> {
     let mut names = Vec::new();
     let mut seeds = 1..4u64;
@@ -111,14 +145,7 @@ fn main() -> anyhow::Result<()> {
                 let (from, to) = range.split_once("..").context("--seeds wants FROM..TO")?;
                 seeds = from.parse()?..to.parse()?;
             }
-            "--off" => match arguments.next().as_deref() {
-                Some("loops") => params.loops = false,
-                Some("pose_graph") => params.pose_graph = false,
-                Some("fit_clearance") => params.fit_clearance = false,
-                Some("recalibrate") => params.recalibrate = false,
-                Some("merge_islands") => params.merge_islands = false,
-                other => bail!("unknown switch {other:?}"),
-            },
+            "--off" => params.switch_off(&arguments.next().context("--off SWITCH")?)?,
             "--verbose" => verbose = true,
             "--paper" => params.policy = Policy::Paper,
             name => names.push(name.to_owned()),
@@ -174,10 +201,14 @@ fn main() -> anyhow::Result<()> {
                 println!("{:?}", assembly.table);
             }
             for m in &assembly.matings {
-                let alone = Assembly { matings: vec![m.clone()], ..assembly.clone() };
+                let alone = Assembly { matings: vec![m.clone()], ..Assembly::default() };
                 let bin = BINS.iter().rposition(|b| m.confidence >= *b).unwrap_or(0);
-                bins[bin].0 += puzzle.score(&pieces, &alone).right_matings;
+                let right = puzzle.score(&pieces, &alone).right_matings;
+                bins[bin].0 += right;
                 bins[bin].1 += 1;
+                if verbose && right == 0 {
+                    println!("  wrong {} in {}: {m:?}", pieces[m.positive_piece].id, pieces[m.negative_piece].id);
+                }
             }
             if verbose && !s.is_perfect() {
                 let mut placements = assembly.placements.clone();
@@ -192,6 +223,7 @@ fn main() -> anyhow::Result<()> {
                 for k in &assembly.unplaced {
                     println!("  {} left over", pieces[*k].id);
                 }
+                missed(&puzzle, &pieces, &solver);
             }
         }
     }

@@ -3,7 +3,7 @@
 //! `cargo run --release -p jigsaw --example scans -- FOLDER [--truth solution.csv] [--out FILE.svg] [--off SWITCH]`
 //! The truth has the columns piece (file stem), column, row, rotation_rad.
 
-use anyhow::{Context, bail};
+use anyhow::Context;
 use isthmus::mask::{Frame, Parameters, segment};
 use jigsaw::{Assembly, Params, Piece, Solver};
 use rayon::prelude::*;
@@ -65,14 +65,7 @@ fn main() -> anyhow::Result<()> {
         match argument.as_str() {
             "--out" => out = arguments.next().map(PathBuf::from),
             "--truth" => truth = arguments.next().map(PathBuf::from),
-            "--off" => match arguments.next().as_deref() {
-                Some("loops") => params.loops = false,
-                Some("pose_graph") => params.pose_graph = false,
-                Some("fit_clearance") => params.fit_clearance = false,
-                Some("recalibrate") => params.recalibrate = false,
-                Some("merge_islands") => params.merge_islands = false,
-                other => bail!("unknown switch {other:?}"),
-            },
+            "--off" => params.switch_off(&arguments.next().context("--off SWITCH")?)?,
             "--candidates" => params.candidates = arguments.next().context("--candidates N")?.parse()?,
             path => folder = Some(PathBuf::from(path)),
         }

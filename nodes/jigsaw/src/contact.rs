@@ -245,7 +245,6 @@ impl Equations {
 fn follow(a: &Outline, b: &Outline, b_from_a: &Isometry2<f64>, band: f64, stride: usize) -> Option<Equations> {
     /// Normals of borders in contact are opposite to within 45°.
     const OPPOSED: f32 = -0.7;
-    let n = b.points.len();
     let reach = (b.radius + band).powi(2);
     let rotation = b_from_a.rotation;
     let mut rows: Vec<(f64, Vector2<f64>, Point)> = Vec::new();
@@ -258,24 +257,8 @@ fn follow(a: &Outline, b: &Outline, b_from_a: &Isometry2<f64>, band: f64, stride
         if f64::from(b.raster.distance[cell]).abs() > band + b.raster.cell {
             continue;
         }
-        let mut i = b.raster.nearest[cell] as usize;
-        let mut best = (p - b.points[i]).norm_squared();
-        loop {
-            let (next, previous) = ((i + 1) % n, (i + n - 1) % n);
-            let (dn, dp) = ((p - b.points[next]).norm_squared(), (p - b.points[previous]).norm_squared());
-            if dn < best && dn <= dp {
-                (best, i) = (dn, next);
-            } else if dp < best {
-                (best, i) = (dp, previous);
-            } else {
-                break;
-            }
-        }
-        let q = b.points[i];
-        let along = (b.points[(i + 1) % n] - q).dot(&(p - q));
-        let other = if along >= 0.0 { (i + 1) % n } else { (i + n - 1) % n };
-        let edge = b.points[other] - q;
-        let part = ((p - q).dot(&edge) / edge.norm_squared().max(f64::EPSILON)).clamp(0.0, 1.0);
+        let (i, other, part) = b.foot(p, b.raster.nearest[cell] as usize);
+        let (q, edge) = (b.points[i], b.points[other] - b.points[i]);
         let normal = b.normals[i] * (1.0 - part as f32) + b.normals[other] * part as f32;
         let mine = rotation * Vector2::new(f64::from(a.normals[k].x), f64::from(a.normals[k].y));
         if normal.x * mine.x as f32 + normal.y * mine.y as f32 > OPPOSED {

@@ -7,6 +7,7 @@ pub mod generate;
 use nalgebra::Isometry2;
 
 mod contact;
+mod copies;
 pub mod correlation;
 mod frame;
 mod index;

@@ -5,11 +5,23 @@
 //! agreement is chance. Three pieces round a corner (brickwork, mosaics) close the same way. A loop is a set of three
 //! or four candidates whose poses agree, each piece entering and leaving by different isthmuses.
 //!
-//! Complexity O(pieces · degree²) for the two-step ways, which are compared only where they meet. The tolerance is
-//! calibrated from the loops themselves: among the best candidates of each mouth, true closures crowd near zero.
+//! 1. *Distance*: how far a loop fails to close is measured against what its candidates leave open (Mahalanobis
+//!    distance; each candidate carries the covariance of its pose, transported round the loop). A tab that may slide
+//!    along its mouth is forgiven just that slide.
+//! 2. *Chance*: the same search with one piece of each way exchanged for another one of the puzzle (decoys, as in the
+//!    target-decoy method of Elias and Gygi 2007) shows how many loops close by chance, and how closely. The more alike
+//!    the pieces are, the more do.
+//! 3. *Mixture*: in three degrees of freedom distances follow a Maxwell distribution, narrow for true loops and wide for
+//!    chance ones. The narrow one is fitted to this puzzle; the ratio of the two is the evidence of a loop.
+//!
+//! Complexity O(pieces · degree²) for the two-step ways, which are compared only where they meet. Where no loops close
+//! (a strip, single joints) nothing is learnt, and what is known of the borders' noise has to serve.
 
 use crate::outline::Outline;
-use nalgebra::{Isometry2, Vector2};
+use crate::placement::rigid_fit;
+use crate::posegraph::lever;
+use isthmus::Point;
+use nalgebra::{Isometry2, Matrix3, Vector2, Vector3};
 
 /// A candidate mating as the assembly sees it: pieces are ranks by id.
 #[derive(Debug, Clone, PartialEq)]
@@ -21,6 +33,10 @@ pub(crate) struct Edge {
     pub(crate) b: usize,
     pub(crate) mouth: usize,
     pub(crate) b_from_a: Isometry2<f64>,
+    /// What the contact leaves open of that pose: covariance of (x, y, turn) of `a` about the point `at`, both in the
+    /// image of `b`, for border residuals of variance one.
+    pub(crate) covariance: Matrix3<f64>,
+    pub(crate) at: Point,
     /// Logarithmic cost; less is better.
     pub(crate) cost: f64,
     /// Place among the candidates of the mouth and of the tab, 0 the best.
@@ -68,11 +84,13 @@ pub(crate) fn conflict(outline: &Outline, p: Slot, q: Slot) -> bool {
     shared > 0.5 * p.path.min(q.path)
 }
 
-/// A closed loop: its candidates, and how far it fails to close, as a fraction of the tolerance.
+/// A closed loop: its candidates, the Mahalanobis distance by which it fails to close, and the evidence (natural
+/// logarithm of odds) that it doesn't close by chance.
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) struct Loop {
     pub(crate) edges: Vec<usize>,
-    pub(crate) error: f64,
+    pub(crate) distance: f64,
+    pub(crate) evidence: f64,
 }
 
 /// How far the two ways may differ: position in piece scales, angle in radians.
@@ -99,83 +117,382 @@ pub(crate) fn difference(outline: &Outline, p: &Isometry2<f64>, q: &Isometry2<f6
     (d.norm() / outline.scale, p.rotation.angle_to(&q.rotation).abs())
 }
 
-/// All loops of the candidates `active` (positions in `edges`).
-pub(crate) fn find(edges: &[Edge], active: &[usize], outlines: &[&Outline], tolerance: Tolerance) -> Vec<Loop> {
-    let n = outlines.len();
-    let mut ways: Vec<Vec<Way>> = vec![Vec::new(); n];
-    for &k in active {
-        let e = &edges[k];
-        let [tab, mouth] = e.slots();
-        let way = |to, pose, leaves, arrives| Way { to, via: None, pose, edges: [k, k], leaves, arrives };
-        ways[e.b].push(way(e.a, e.b_from_a, mouth, tab));
-        ways[e.a].push(way(e.b, e.b_from_a.inverse(), tab, mouth));
-    }
-    use rayon::prelude::*;
-    let found: Vec<Vec<Loop>> = (0..n).into_par_iter().map(|a| loops_from(a, &ways, outlines, tolerance)).collect();
-    found.into_iter().flatten().collect()
+/// Pose of the piece `e.a` (or `e.b`) as seen from the other one, and what the candidate leaves open of it at
+/// `reference`, both in the frame of which `pose` tells how the piece left lies in it.
+fn step(e: &Edge, from: usize, pose: &Isometry2<f64>, reference: Point) -> (Isometry2<f64>, Matrix3<f64>) {
+    let (step, rotation, at) = if e.b == from {
+        (e.b_from_a, pose.rotation, e.at)
+    } else {
+        let a_from_b = e.b_from_a.inverse();
+        (a_from_b, pose.rotation * a_from_b.rotation, a_from_b * e.at)
+    };
+    let mut turn = Matrix3::identity();
+    turn.fixed_view_mut::<2, 2>(0, 0).copy_from(rotation.to_rotation_matrix().matrix());
+    let motion = lever(pose * at, reference) * turn;
+    (pose * step, motion * e.covariance * motion.transpose())
 }
 
-/// The loops in which `a` has the least rank.
-fn loops_from(a: usize, ways: &[Vec<Way>], outlines: &[&Outline], tolerance: Tolerance) -> Vec<Loop> {
-    let mut long: Vec<Way> = Vec::new();
-    for first in ways[a].iter().filter(|w| w.to > a) {
-        long.push(*first);
-        for second in ways[first.to].iter().filter(|w| w.to > a && w.to != first.to) {
-            if conflict(outlines[first.to], first.arrives, second.leaves) {
-                continue;
-            }
-            long.push(Way {
-                to: second.to,
-                via: Some(first.to),
-                pose: first.pose * second.pose,
-                edges: [first.edges[0], second.edges[0]],
-                leaves: first.leaves,
-                arrives: second.arrives,
-            });
-        }
+/// Covariance of where a way leads, at `reference`, both in the frame of the piece `start`.
+fn uncertainty(edges: &[Edge], start: usize, way: &Way, reference: Point) -> Matrix3<f64> {
+    let (pose, first) = step(&edges[way.edges[0]], start, &Isometry2::identity(), reference);
+    match way.via {
+        Some(via) => first + step(&edges[way.edges[1]], via, &pose, reference).1,
+        None => first,
     }
-    long.sort_by_key(|w| w.to);
-    let mut found = Vec::new();
-    for group in long.chunk_by(|p, q| p.to == q.to) {
-        if group.len() < 2 {
-            continue;
+}
+
+/// Mahalanobis distance of two poses of a point, given the sum of their covariances there.
+fn mahalanobis(p: &Isometry2<f64>, q: &Isometry2<f64>, point: Point, covariance: &Matrix3<f64>) -> f64 {
+    let d = p * point - q * point;
+    let delta = Vector3::new(d.x, d.y, q.rotation.angle_to(&p.rotation));
+    covariance.cholesky().map_or(f64::INFINITY, |c| delta.dot(&c.solve(&delta)).max(0.0).sqrt())
+}
+
+/// What a candidate says about where one island lies in another.
+pub(crate) struct Said<'a> {
+    pub(crate) edge: &'a Edge,
+    /// The piece of the candidate that lies in the fixed island, and its pose there.
+    pub(crate) from: usize,
+    pub(crate) fixed: Isometry2<f64>,
+    /// Pose of the moving island in the fixed one.
+    pub(crate) pose: Isometry2<f64>,
+}
+
+/// Mahalanobis distance of what two candidates between the same two islands say, at a point of the moving island.
+pub(crate) fn disagreement(p: &Said, q: &Said, point: Point) -> f64 {
+    let reference = q.pose * point;
+    let covariance = step(p.edge, p.from, &p.fixed, reference).1 + step(q.edge, q.from, &q.fixed, reference).1;
+    mahalanobis(&p.pose, &q.pose, point, &covariance)
+}
+
+/// Mahalanobis distance of what a candidate says from how its pieces lie, at a point of its piece `a`.
+pub(crate) fn deviation(edge: &Edge, b_from_a: &Isometry2<f64>, point: Point) -> f64 {
+    let (_, covariance) = step(edge, edge.b, &Isometry2::identity(), b_from_a * point);
+    mahalanobis(&edge.b_from_a, b_from_a, point, &covariance)
+}
+
+/// The ways between pieces, and all it takes to see which of them close.
+pub(crate) struct Ways<'a> {
+    edges: &'a [Edge],
+    outlines: &'a [&'a Outline],
+    tolerance: Tolerance,
+    steps: Vec<Vec<Way>>,
+}
+
+/// What decoys show: distances of those that close, and how many of those come from ways that really close.
+#[derive(Debug, Clone, Default)]
+pub(crate) struct Decoys {
+    distances: Vec<f64>,
+    akin: usize,
+}
+
+impl<'a> Ways<'a> {
+    /// The ways along the candidates `active` (positions in `edges`).
+    pub(crate) fn new(edges: &'a [Edge], active: &[usize], outlines: &'a [&'a Outline], tolerance: Tolerance) -> Self {
+        let mut steps: Vec<Vec<Way>> = vec![Vec::new(); outlines.len()];
+        for &k in active {
+            let e = &edges[k];
+            let [tab, mouth] = e.slots();
+            let way = |to, pose, leaves, arrives| Way { to, via: None, pose, edges: [k, k], leaves, arrives };
+            steps[e.b].push(way(e.a, e.b_from_a, mouth, tab));
+            steps[e.a].push(way(e.b, e.b_from_a.inverse(), tab, mouth));
         }
-        let outline = outlines[group[0].to];
-        // Sorted by x the comparison stays near the diagonal.
-        let mut placed: Vec<(f64, &Way)> = group.iter().map(|w| ((w.pose * outline.centroid).x, w)).collect();
-        placed.sort_by(|p, q| p.0.total_cmp(&q.0).then(p.1.edges.cmp(&q.1.edges)));
-        let reach = tolerance.position * outline.scale;
-        for (i, (x, p)) in placed.iter().enumerate() {
-            for (y, q) in &placed[i + 1..] {
-                if y - x > reach {
-                    break;
-                }
-                let triangle = match (p.via, q.via) {
-                    (None, None) => continue,
-                    (Some(u), Some(v)) if u == v => continue,
-                    (Some(_), Some(_)) => false,
-                    // A triangle is seen from `a` twice; take it once.
-                    (Some(v), None) | (None, Some(v)) if v > p.to => true,
-                    _ => continue,
-                };
-                if conflict(outlines[a], p.leaves, q.leaves) || conflict(outline, p.arrives, q.arrives) {
+        Self { edges, outlines, tolerance, steps }
+    }
+
+    /// All loops that close within the tolerance.
+    pub(crate) fn close(&self) -> Vec<Loop> {
+        use rayon::prelude::*;
+        let found: Vec<Vec<Loop>> = (0..self.outlines.len()).into_par_iter().map(|a| self.close_at(a)).collect();
+        found.into_iter().flatten().collect()
+    }
+
+    /// What would close if the piece on each way of two steps were another one; `round` makes different decoys.
+    pub(crate) fn close_decoys(&self, round: u64) -> Decoys {
+        use rayon::prelude::*;
+        let slots: [Vec<Slot>; 2] = [false, true].map(|tab| {
+            let count = |o: &Outline| if tab { o.tabs.len() } else { o.mouths.len() };
+            let all = self.outlines.iter().enumerate();
+            all.flat_map(|(piece, o)| (0..count(o)).map(move |index| Slot { piece, tab, index })).collect()
+        });
+        let found: Vec<Decoys> =
+            (0..self.outlines.len()).into_par_iter().map(|a| self.decoys_at(a, &slots, round)).collect();
+        found.into_iter().fold(Decoys::default(), |mut all, some| {
+            all.distances.extend(some.distances);
+            all.akin += some.akin;
+            all
+        })
+    }
+
+    /// Ways of one and two steps from `a` to pieces of higher rank, by where they lead.
+    fn from(&self, a: usize) -> Vec<Way> {
+        let mut long: Vec<Way> = Vec::new();
+        for first in self.steps[a].iter().filter(|w| w.to > a) {
+            long.push(*first);
+            for second in self.steps[first.to].iter().filter(|w| w.to > a && w.to != first.to) {
+                if conflict(self.outlines[first.to], first.arrives, second.leaves) {
                     continue;
                 }
-                let (d, turn) = difference(outline, &p.pose, &q.pose);
-                if d > tolerance.position || turn > tolerance.angle {
-                    continue;
-                }
-                let mut members = vec![p.edges[0], q.edges[0]];
-                if triangle {
-                    let long = if p.via.is_some() { p } else { q };
-                    members = vec![if p.via.is_some() { q.edges[0] } else { p.edges[0] }, long.edges[0], long.edges[1]];
-                } else {
-                    members.extend([p.edges[1], q.edges[1]]);
-                }
-                let error = (d / tolerance.position).hypot(turn / tolerance.angle);
-                found.push(Loop { edges: members, error });
+                long.push(Way {
+                    to: second.to,
+                    via: Some(first.to),
+                    pose: first.pose * second.pose,
+                    edges: [first.edges[0], second.edges[0]],
+                    leaves: first.leaves,
+                    arrives: second.arrives,
+                });
             }
         }
+        long.sort_by_key(|w| w.to);
+        long
     }
-    found
+
+    /// Where a way leads, across the line on which ways are sorted.
+    fn place(&self, way: &Way) -> f64 {
+        (way.pose * self.outlines[way.to].centroid).x
+    }
+
+    /// The loops in which `a` has the least rank.
+    fn close_at(&self, a: usize) -> Vec<Loop> {
+        let mut found = Vec::new();
+        for group in self.from(a).chunk_by(|p, q| p.to == q.to) {
+            // Sorted by x the comparison stays near the diagonal.
+            let mut placed: Vec<(f64, &Way)> = group.iter().map(|w| (self.place(w), w)).collect();
+            placed.sort_by(|p, q| p.0.total_cmp(&q.0).then(p.1.edges.cmp(&q.1.edges)));
+            let reach = self.tolerance.position * self.outlines[group[0].to].scale;
+            for (i, (x, p)) in placed.iter().enumerate() {
+                let near = placed[i + 1..].iter().take_while(|(y, _)| y - x <= reach);
+                found.extend(near.filter_map(|(_, q)| self.join(a, p, q)));
+            }
+        }
+        found
+    }
+
+    /// The decoys among the loops in which `a` has the least rank.
+    fn decoys_at(&self, a: usize, slots: &[Vec<Slot>; 2], round: u64) -> Decoys {
+        let mut found = Decoys::default();
+        for group in self.from(a).chunk_by(|p, q| p.to == q.to) {
+            let mut placed: Vec<(f64, &Way)> = group.iter().map(|w| (self.place(w), w)).collect();
+            placed.sort_by(|p, q| p.0.total_cmp(&q.0).then(p.1.edges.cmp(&q.1.edges)));
+            let reach = self.tolerance.position * self.outlines[group[0].to].scale;
+            for p in group {
+                let Some(decoy) = self.exchanged(a, p, slots, round) else { continue };
+                let x = self.place(&decoy);
+                let from = placed.partition_point(|(y, _)| *y < x - reach);
+                let near = placed[from..].iter().take_while(|(y, _)| *y <= x + reach);
+                for (_, q) in near.filter(|(_, q)| q.edges != p.edges) {
+                    if let Some(l) = self.join(a, &decoy, q) {
+                        found.distances.push(l.distance);
+                        found.akin += usize::from(self.join(a, p, q).is_some());
+                    }
+                }
+            }
+        }
+        found
+    }
+
+    /// A way of two steps with the piece between them exchanged for some other one, which is entered and left by
+    /// isthmuses of the same polarity; `None` for a single step.
+    fn exchanged(&self, a: usize, way: &Way, slots: &[Vec<Slot>; 2], round: u64) -> Option<Way> {
+        let via = way.via?;
+        let [first, second] = way.edges.map(|k| &self.edges[k]);
+        let of = |e: &Edge| e.slots().into_iter().find(|s| s.piece == via);
+        let (enters, leaves) = (of(first)?, of(second)?);
+        // Multiplication by a large odd number scatters what is looked up (Knuth 1973, Fibonacci hashing).
+        let seed = [a, way.edges[0], way.edges[1]]
+            .iter()
+            .fold(round + 1, |s, k| (s ^ *k as u64).wrapping_mul(0x9E37_79B9_7F4A_7C15).rotate_left(29));
+        let doors = &slots[usize::from(enters.tab)];
+        let door = doors[(seed >> 8) as usize % doors.len()];
+        let others: Vec<&Slot> = {
+            let all = &slots[usize::from(leaves.tab)];
+            let from = all.partition_point(|s| s.piece < door.piece);
+            all[from..].iter().take_while(|s| s.piece == door.piece).filter(|s| **s != door).collect()
+        };
+        if door.piece == via || others.is_empty() {
+            return None;
+        }
+        let other = *others[(seed >> 40) as usize % others.len()];
+        // The stranger lies as its first isthmus says; its second one leads elsewhere than that of the piece it replaces.
+        let by_first = self.laid(enters, door)?;
+        let by_second = self.laid(leaves, other)?;
+        let (to_via, _) = step(first, a, &Isometry2::identity(), Point::origin());
+        let from_via = to_via.inverse() * way.pose;
+        Some(Way { pose: to_via * by_first * by_second.inverse() * from_via, ..*way })
+    }
+
+    /// Pose of the piece of `other` in which its segment lies on that of `slot` best.
+    fn laid(&self, slot: Slot, other: Slot) -> Option<Isometry2<f64>> {
+        /// Points of a segment that are laid on one another.
+        const POINTS: usize = 16;
+        let points = |s: Slot| -> Option<Vec<Point>> {
+            let o = self.outlines[s.piece];
+            let segment = if s.tab { o.tabs.get(s.index)? } else { o.mouths.get(s.index)? };
+            let part = |k: usize| segment.arc + segment.path * k as f64 / (POINTS - 1) as f64;
+            Some((0..POINTS).map(|k| o.at_arc(part(k))).collect())
+        };
+        Some(rigid_fit(&points(other)?, &points(slot)?))
+    }
+
+    /// The loop that two ways from `a` to one piece make, if they do.
+    fn join(&self, a: usize, p: &Way, q: &Way) -> Option<Loop> {
+        let triangle = match (p.via, q.via) {
+            (None, None) => return None,
+            (Some(u), Some(v)) if u == v => return None,
+            (Some(_), Some(_)) => false,
+            // A triangle is seen from `a` twice; take it once.
+            (Some(v), None) | (None, Some(v)) if v > p.to => true,
+            _ => return None,
+        };
+        let outline = self.outlines[p.to];
+        if conflict(self.outlines[a], p.leaves, q.leaves) || conflict(outline, p.arrives, q.arrives) {
+            return None;
+        }
+        let (d, turn) = difference(outline, &p.pose, &q.pose);
+        if d > self.tolerance.position || turn > self.tolerance.angle {
+            return None;
+        }
+        let edges = if triangle {
+            let (long, short) = if p.via.is_some() { (p, q) } else { (q, p) };
+            vec![short.edges[0], long.edges[0], long.edges[1]]
+        } else {
+            vec![p.edges[0], q.edges[0], p.edges[1], q.edges[1]]
+        };
+        let reference = p.pose * outline.centroid;
+        let covariance = uncertainty(self.edges, a, p, reference) + uncertainty(self.edges, a, q, reference);
+        let distance = mahalanobis(&p.pose, &q.pose, outline.centroid, &covariance);
+        Some(Loop { edges, distance, evidence: 0.0 })
+    }
+}
+
+/// How the loops of a puzzle close: true ones narrowly, chance ones widely.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(crate) struct Closure {
+    /// Typical distance of true loops, and how many there are.
+    narrow: f64,
+    right: f64,
+    /// Typical distance of chance loops, and how many there are.
+    wide: f64,
+    chance: f64,
+    /// How often two candidates agree by chance where two right ones would.
+    rate: f64,
+}
+
+impl Closure {
+    /// Before any loop is known: `narrow` from the noise of the borders, `wide` from the tolerance of the search.
+    pub(crate) fn guess(narrow: f64, wide: f64) -> Self {
+        /// The least that is believed of it: what decoys don't show they may just have missed.
+        const RATE: f64 = 0.01;
+        Self { narrow, right: 0.0, wide: wide.max(LEAST_RATIO * narrow), chance: 1.0, rate: RATE }
+    }
+
+    /// Fits the two distributions to the loops found (maximum posterior over a grid of both scales; the counts by
+    /// expectation and maximisation). Decoys say beforehand how chance loops are, the guess how true ones are.
+    pub(crate) fn fit(guess: &Self, found: &[Loop], decoys: &[Decoys]) -> Self {
+        /// Each scale tried is this factor wider than the one before.
+        const FINENESS: f64 = 1.25;
+        /// How far (natural logarithm) the guess may be off: real pieces close ten times as wide as their borders' noise.
+        const GUESS_DEVIATION: f64 = 1.2;
+        /// How far decoys may be off: what is among the candidates resembles the right piece more than any stranger.
+        const DECOY_DEVIATION: f64 = 0.7;
+        /// Decoys exchange the two pieces on the ways; any of the four of a loop may be wrong.
+        const OTHERS: f64 = 2.0;
+        /// Expectation and maximisation of the counts.
+        const STEPS: usize = 12;
+        /// Loops that are looked at: more don't make the scales surer.
+        const LOOPS: usize = 400;
+        let rounds = decoys.len().max(1) as f64;
+        let mut closed: Vec<f64> = decoys.iter().flat_map(|d| d.distances.iter().copied()).collect();
+        closed.push(guess.wide);
+        closed.sort_by(f64::total_cmp);
+        let decoy_wide = closed[(closed.len() - 1) / 2] / MAXWELL_MEDIAN;
+        let expected = OTHERS * closed.len() as f64 / rounds;
+        let akin = decoys.iter().map(|d| d.akin).sum::<usize>() as f64;
+        let rate = ((akin + 1.0) / (OTHERS * rounds * found.len() as f64 + 1.0)).clamp(guess.rate, 1.0);
+        let mut distances: Vec<f64> = found.iter().map(|l| l.distance).collect();
+        distances.sort_by(f64::total_cmp);
+        let stride = distances.len().div_ceil(LOOPS).max(1);
+        let distances: Vec<f64> = distances.into_iter().skip(stride / 2).step_by(stride).collect();
+        let share = distances.len() as f64 / found.len().max(1) as f64;
+        let scales = |from: f64, to: f64| {
+            std::iter::successors(Some(from), |s| Some(s * FINENESS)).take_while(move |s| *s <= to)
+        };
+        let densities = |scale: f64| distances.iter().map(|z| maxwell(*z, scale)).collect::<Vec<f64>>();
+        let reach = (3.0 * DECOY_DEVIATION).exp();
+        let wides: Vec<(f64, Vec<f64>)> =
+            scales(decoy_wide / reach, decoy_wide * reach).map(|s| (s, densities(s))).collect();
+        let mut best = (f64::NEG_INFINITY, Self { right: 0.0, wide: decoy_wide, chance: expected, rate, ..*guess });
+        if distances.is_empty() {
+            return best.1;
+        }
+        for narrow in scales(guess.narrow * (-2.0 * GUESS_DEVIATION).exp(), decoy_wide * reach / LEAST_RATIO) {
+            let right_densities = densities(narrow);
+            for (wide, chance_densities) in wides.iter().filter(|w| w.0 >= LEAST_RATIO * narrow) {
+                let (mut right, mut chance) = (0.5 * distances.len() as f64, expected * share);
+                let mut sum = 0.0;
+                for _ in 0..STEPS {
+                    let mut among_right = 0.0;
+                    sum = 0.0;
+                    for (f, g) in right_densities.iter().zip(chance_densities) {
+                        let (f, g) = (right * f, chance * g);
+                        let both = (f + g).max(f64::MIN_POSITIVE);
+                        among_right += f / both;
+                        sum += both.ln();
+                    }
+                    // The decoys' count weighs like the loops' own.
+                    chance = 0.5 * (distances.len() as f64 - among_right + expected * share);
+                    right = among_right;
+                }
+                let off =
+                    |scale: f64, expected: f64, deviation: f64| 0.5 * ((scale / expected).ln() / deviation).powi(2);
+                let value = sum
+                    - right
+                    - chance
+                    - off(narrow, guess.narrow, GUESS_DEVIATION)
+                    - off(*wide, decoy_wide, DECOY_DEVIATION);
+                if value > best.0 {
+                    let found = Self { narrow, right: right / share, wide: *wide, chance: chance / share, rate };
+                    best = (value, found);
+                }
+            }
+        }
+        best.1
+    }
+
+    /// Logarithm of the odds that a loop which fails to close by `distance` is right.
+    pub(crate) fn evidence(&self, distance: f64) -> f64 {
+        self.ratio(distance, self.narrow) + (self.right.max(f64::MIN_POSITIVE) / self.chance).ln()
+    }
+
+    /// Logarithm of how much likelier two candidates disagree by no more than `distance` if both are right than by
+    /// chance.
+    pub(crate) fn agreement(&self, distance: f64) -> f64 {
+        self.ratio(distance, DRIFT * self.narrow) - self.rate.ln()
+    }
+
+    /// Whether right candidates may disagree as much.
+    pub(crate) fn admits(&self, distance: f64) -> bool {
+        /// A Maxwell distribution leaves one in 10⁵ beyond five times its scale.
+        const BEYOND: f64 = 5.0;
+        distance <= BEYOND * DRIFT * self.narrow
+    }
+
+    fn ratio(&self, distance: f64, narrow: f64) -> f64 {
+        let log = |scale: f64| -3.0 * scale.ln() - 0.5 * (distance / scale).powi(2);
+        log(narrow) - log(self.wide.max(narrow))
+    }
+}
+
+/// Chance loops close at least this much wider than true ones, or nothing can tell them apart.
+const LEAST_RATIO: f64 = 3.0;
+/// Poses in islands are off by this much more than those of two steps.
+const DRIFT: f64 = 1.5;
+
+/// Median of a Maxwell distribution, in its scale.
+const MAXWELL_MEDIAN: f64 = 1.538;
+
+/// Density of the length of a vector of three normal deviates.
+fn maxwell(distance: f64, scale: f64) -> f64 {
+    let z = distance / scale;
+    (2.0 / std::f64::consts::PI).sqrt() * z * z / scale * (-0.5 * z * z).exp()
 }

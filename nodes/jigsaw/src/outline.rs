@@ -180,6 +180,43 @@ impl Outline {
         a + (b - a) * (s - i)
     }
 
+    /// Foot of a point on the border, downhill from the border point `from`: a border point, the neighbour towards which
+    /// the foot lies, and which part of the way.
+    pub(crate) fn foot(&self, p: Point, from: usize) -> (usize, usize, f64) {
+        let n = self.points.len();
+        let mut i = from;
+        let mut best = (p - self.points[i]).norm_squared();
+        loop {
+            let (next, previous) = ((i + 1) % n, (i + n - 1) % n);
+            let (dn, dp) = ((p - self.points[next]).norm_squared(), (p - self.points[previous]).norm_squared());
+            if dn < best && dn <= dp {
+                (best, i) = (dn, next);
+            } else if dp < best {
+                (best, i) = (dp, previous);
+            } else {
+                break;
+            }
+        }
+        let q = self.points[i];
+        let along = (self.points[(i + 1) % n] - q).dot(&(p - q));
+        let other = if along >= 0.0 { (i + 1) % n } else { (i + n - 1) % n };
+        let edge = self.points[other] - q;
+        (i, other, ((p - q).dot(&edge) / edge.norm_squared().max(f64::EPSILON)).clamp(0.0, 1.0))
+    }
+
+    /// Signed distance of a point from the border, positive outside, if it is less than `reach`.
+    pub(crate) fn gap(&self, p: Point, reach: f64) -> Option<f64> {
+        let cell = self.raster.cell_of(p)?;
+        if f64::from(self.raster.distance[cell]).abs() > reach + self.raster.cell {
+            return None;
+        }
+        let (i, other, part) = self.foot(p, self.raster.nearest[cell] as usize);
+        let normal = self.normals[i] * (1.0 - part as f32) + self.normals[other] * part as f32;
+        let d = p - (self.points[i] + (self.points[other] - self.points[i]) * part);
+        let outside = d.x * f64::from(normal.x) + d.y * f64::from(normal.y) >= 0.0;
+        (d.norm() <= reach).then(|| if outside { d.norm() } else { -d.norm() })
+    }
+
     fn prepare(&self, index: usize, isthmus: &Isthmus) -> Segment {
         let tab = isthmus.polarity == Polarity::Positive;
         let mut shape = [0f32; SHAPE_SAMPLES];

@@ -74,12 +74,35 @@ pub enum ParamsError {
     /// The index must keep something.
     #[error("invalid candidates={0}: must be 1..={max}", max = Params::MAX_CANDIDATES)]
     Candidates(usize),
+    /// No part of the method is called so.
+    #[error("invalid switch {0:?}: must be one of {switches}", switches = Params::SWITCHES.join(", "))]
+    Switch(String),
     /// More threads than any machine this runs on.
     #[error("invalid threads={0}: must be 0..={max} (0 = one for each processor)", max = Params::MAX_THREADS)]
     Threads(usize),
 }
 
 impl Params {
+    /// The switches that [`Params::switch_off`] knows.
+    pub const SWITCHES: [&str; 5] = ["loops", "pose_graph", "fit_clearance", "recalibrate", "merge_islands"];
+
+    /// Switches a part of the method off by its name, to measure what it brings.
+    ///
+    /// # Errors
+    /// There is no such switch.
+    pub fn switch_off(&mut self, name: &str) -> Result<(), ParamsError> {
+        let switch = match name {
+            "loops" => &mut self.loops,
+            "pose_graph" => &mut self.pose_graph,
+            "fit_clearance" => &mut self.fit_clearance,
+            "recalibrate" => &mut self.recalibrate,
+            "merge_islands" => &mut self.merge_islands,
+            _ => return Err(ParamsError::Switch(name.to_owned())),
+        };
+        *switch = false;
+        Ok(())
+    }
+
     /// Most candidates a mouth may keep: beyond it chance loops drown the true ones and memory grows for nothing.
     pub const MAX_CANDIDATES: usize = 1000;
     /// Most threads that may be asked for.

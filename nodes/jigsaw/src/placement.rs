@@ -13,10 +13,10 @@
 //!    extended to the shoulders up to the corners, for those that aren't hopeless; then all nodes, for the best.
 //!
 //! Complexity O(rounds · samples), 1 µs to 10 µs. Fails where the first pose is off by more than about half a neck,
-//! and slides where the borders are near-circular or straight: the clearance is clamped and h.
+//! and slides where the borders are near-circular or straight: the clearance is clamped and damped.
 
 use crate::outline::{LEAST_WIDTH, Node, ROUGH_SAMPLES, Segment};
-use nalgebra::{Isometry2, Matrix4, Point2, Vector2, Vector4};
+use nalgebra::{Isometry2, Matrix3, Matrix4, Point2, Vector2, Vector3, Vector4};
 
 /// Limit of the fitted clearance in piece scales: no cut or segmentation takes more, and a free fit may diverge.
 pub(crate) const MAX_CLEARANCE: f64 = 0.03;
@@ -53,6 +53,9 @@ pub(crate) struct Fit {
     /// Areas of overlap and underlap along the match segment, as posed, clearance included.
     pub(crate) pos_gap: f64,
     pub(crate) neg_gap: f64,
+    /// Information about (x, y, turn) of the tab's piece about the mouth's isthmus point, clearance eliminated, for
+    /// residuals of variance one at every node.
+    pub(crate) information: Matrix3<f64>,
 }
 
 /// A pose during refinement: tab's local frame to mouth's local frame.
@@ -268,6 +271,15 @@ impl Feet {
         f64::from(*self.off.select_nth_unstable_by(middle, f32::total_cmp).1)
     }
 
+    /// What the contact tells about the pose: the normal matrix without the clearance (Schur complement).
+    fn information(&mut self, clearance: f64, limit: f64, free: bool) -> Matrix3<f64> {
+        let width = weight_width(self.spread(clearance), limit);
+        let (h, ..) = self.normal_equations(clearance, width);
+        let block = h.fixed_view::<3, 3>(0, 0).into_owned();
+        let column: Vector3<f64> = h.fixed_view::<3, 1>(0, 3).into_owned();
+        if free && h[(3, 3)] > f64::EPSILON { block - column * column.transpose() / h[(3, 3)] } else { block }
+    }
+
     /// Weighted normal equations over (x, y, turn, clearance) about the local origin: matrix, right side, sum of
     /// weights.
     #[allow(clippy::needless_range_loop, reason = "a lane of many arrays side by side")]
@@ -313,9 +325,14 @@ impl Feet {
     }
 }
 
+/// Width of the robust weights, given the typical residual and the limit of the clearance.
+fn weight_width(spread: f64, limit: f64) -> f64 {
+    (3.0 * spread).max(LEAST_WIDTH / MAX_CLEARANCE * limit)
+}
+
 /// One step of weighted least squares.
 fn step(feet: &mut Feet, pose: &mut Pose, clearance: &mut f64, free: bool, limit: f64) {
-    let width = (3.0 * feet.spread(*clearance)).max(LEAST_WIDTH / MAX_CLEARANCE * limit);
+    let width = weight_width(feet.spread(*clearance), limit);
     let (mut h, mut g, total) = feet.normal_equations(*clearance, width);
     if total < 4.0 {
         return;
@@ -418,7 +435,8 @@ fn fit(
     }
     let cap = RESIDUAL_CAP * scale;
     let residual = feet.residual(feet.points(), clearance, cap);
-    Some(figures(tab, mouth, feet, &pose, clearance, (residual, cap), tab.step * stride as f64))
+    let information = feet.information(clearance, limit, free) * stride as f64;
+    Some(Fit { information, ..figures(tab, mouth, feet, &pose, clearance, (residual, cap), tab.step * stride as f64) })
 }
 
 /// The figures of a finished refinement.
@@ -445,6 +463,7 @@ fn figures(
         ave_gap: feet.residual(feet.core.clone(), clearance, cap),
         pos_gap,
         neg_gap,
+        information: Matrix3::identity(),
     }
 }
 

@@ -21,8 +21,8 @@ pub(crate) struct Factor {
 /// An eliminated column: inverse of its pivot, and the off-diagonal blocks with their nodes.
 type Column = (Matrix3<f64>, Vec<(usize, Matrix3<f64>)>);
 
-/// Motion at a point `to` per motion of a node with reference point `from`.
-fn lever(from: Point2<f64>, to: Point2<f64>) -> Matrix3<f64> {
+/// Motion (x, y, turn) at a point `to` per motion of the same body at a point `from`.
+pub(crate) fn lever(from: Point2<f64>, to: Point2<f64>) -> Matrix3<f64> {
     let d = to - from;
     Matrix3::new(1.0, 0.0, -d.y, 0.0, 1.0, d.x, 0.0, 0.0, 1.0)
 }

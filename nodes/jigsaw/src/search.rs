@@ -11,14 +11,17 @@
 //! 5. *Verification*: pieces that overlap or don't follow their neighbours are taken out (islands split at bad
 //!    contacts), and growth is tried again without them; a step that loses more than it brings is undone.
 
+mod fill;
+
 use crate::contact::{ClearancePrior, Contact, Memory};
-use crate::loops::{self, Edge, Slot, Tolerance, conflict, difference};
+use crate::copies::copies;
+use crate::loops::{self, Closure, Edge, Said, Slot, Tolerance, conflict, difference};
 use crate::outline::Outline;
 use crate::posegraph::{Factor, minimise};
 use crate::solver::Budget;
 use crate::{Params, Policy, placement};
-use nalgebra::{Isometry2, Matrix3, Point2, Translation2, UnitComplex, Vector2};
-use std::collections::{BTreeMap, HashMap};
+use nalgebra::{Isometry2, Matrix3, Point2, Translation2, UnitComplex, Vector2, Vector3};
+use std::collections::{BTreeMap, BTreeSet, HashMap};
 
 /// Overlap of two pieces that can't be a matter of drift or clearance, in squared piece scales.
 const OVERLAP: f64 = 0.02;
@@ -26,16 +29,14 @@ const OVERLAP: f64 = 0.02;
 const UNREFINED_OVERLAP: f64 = 0.05;
 /// Loops of refined poses close to within this on real pieces (0.8 % and 0.44° measured); calibration tightens it.
 const LOOSE: Tolerance = Tolerance { position: 0.04, angle: 0.05 };
-/// A closure this many times the typical one is no closure.
-const CLOSURE_FACTOR: f64 = 5.0;
-/// So many loops tell a puzzle's closures from chance if their median error is at most this part of the loose
-/// tolerance: true closures crowd near zero, chance ones spread over the whole of it (median near 0.7).
-const CROWD: (usize, f64) = (4, 0.4);
-/// Tolerance never tighter than this: below it only the noise of the noise is measured.
-const TIGHT: Tolerance = Tolerance { position: 0.003, angle: 0.003 };
+/// Sets of decoys by which chance closure is measured.
+const DECOYS: u64 = 3;
+/// True loops close this many times as wide as the borders' residuals say, as a first guess: neighbouring residuals
+/// are alike (1 to 2 on generated pieces, 4 to 12 on real ones, which don't keep their shape exactly).
+const STIFFNESS: f64 = 3.0;
 /// Pose agreement of candidates with an island that has been adjusted.
 const AGREE: Tolerance = Tolerance { position: 0.05, angle: 0.08 };
-/// The same when calibrated, at least.
+/// So little is always agreement: adjusted islands drift by it.
 const MIN_AGREE: Tolerance = Tolerance { position: 0.015, angle: 0.02 };
 /// Steps along the border in an adjustment, in piece scales: while growing, and at the end, where 200 points around a
 /// piece leave a tenth of the noise of one.
@@ -92,6 +93,8 @@ struct State {
     joined: Vec<usize>,
     used: HashMap<Slot, usize>,
     refined: Vec<usize>,
+    /// Evidence for pieces that were placed because their whole border fits.
+    fitted: BTreeMap<usize, f64>,
 }
 
 impl State {
@@ -103,6 +106,7 @@ impl State {
             joined: Vec::new(),
             used: HashMap::new(),
             refined: vec![1; n],
+            fitted: BTreeMap::new(),
         }
     }
 }
@@ -115,16 +119,20 @@ struct Model {
 }
 
 impl Model {
+    /// From mean and deviation of either. Deviations are kept within what is reasonable: never so narrow that a good
+    /// candidate looks bad, never so wide that everything looks alike. Wrong ones cost no less and spread no less than
+    /// right ones, so that a greater cost is never better evidence.
+    fn between(right: (f64, f64), wrong: (f64, f64)) -> Self {
+        let right = (right.0.min(wrong.0), right.1.clamp(0.15, 0.5));
+        Self { right, wrong: (wrong.0, wrong.1.clamp(0.2, 0.7).max(right.1)) }
+    }
+
     /// Logarithm of how much likelier a cost is for a right candidate than for the best wrong one of a mouth.
     fn evidence(&self, cost: f64) -> f64 {
         let density = |(mean, deviation): (f64, f64)| {
             let z = (cost.max(self.right.0) - mean) / deviation;
             -0.5 * z * z - f64::ln(deviation)
         };
-        // Beyond the mean of the wrong ones the two densities cross again; there it is simply wrong.
-        if cost > self.wrong.0.max(self.right.0 + self.right.1) {
-            return -STRONG;
-        }
         (density(self.right) - density(self.wrong)).clamp(-STRONG, STRONG)
     }
 }
@@ -133,14 +141,20 @@ impl Model {
 const STRONG: f64 = 12.0;
 /// Evidence of one more candidate that agrees on a pose, or of one closed loop: chance agreement is rarer than this.
 const AGREEMENT: f64 = 4.0;
-/// Evidence that a join must have: odds of fifty to one.
-const ACCEPT: f64 = 4.0;
+/// Evidence that a join must have: odds of twenty to one.
+const ACCEPT: f64 = 3.0;
+/// Evidence that a loop must have, on which all else is built: odds of a hundred to one.
+const FOUND: f64 = 4.5;
 /// Evidence below which a candidate is no mating, whatever supports it.
 const IMPLAUSIBLE: f64 = -6.0;
 /// Most that one candidate counts against the pose that it shares with others.
 const WORN: f64 = -3.0;
-/// How much farther apart the poses of two candidates may be for each scale that lies between them (their turn).
-const SWING: f64 = 0.008;
+/// Candidates that agree on how two islands lie to each other, and the evidence for it.
+#[derive(Debug, Clone)]
+struct Group {
+    members: Vec<usize>,
+    evidence: f64,
+}
 
 struct Assembler<'a> {
     outlines: &'a [&'a Outline],
@@ -154,8 +168,10 @@ struct Assembler<'a> {
     prior: ClearancePrior,
     /// What true and false candidates cost.
     model: Model,
-    /// How far poses of true candidates may differ from an adjusted island.
-    agree: Tolerance,
+    /// How loops close.
+    closure: Closure,
+    /// Pieces that wait: copies of others, until those are placed.
+    aside: Vec<bool>,
     state: State,
     backtracks: usize,
     partial: bool,
@@ -183,6 +199,8 @@ pub(crate) fn assemble(
             b: j.b,
             mouth: j.mouth,
             b_from_a: j.fit.negative_from_positive,
+            covariance: covariance(&j.fit.information, outlines[j.b].scale),
+            at: outlines[j.b].mouths[j.mouth].origin,
             cost: j.fit.residual.max(1e-4).ln(),
             mouth_rank: 0,
             tab_rank: 0,
@@ -209,7 +227,8 @@ pub(crate) fn assemble(
             right: ((1.5 * noise + 0.001 * scale).ln(), 0.4),
             wrong: ((1.5 * noise + 0.01 * scale).ln(), 0.5),
         },
-        agree: AGREE,
+        closure: Closure::guess(0.02, 1.0),
+        aside: vec![false; n],
         state: State::new(n),
         backtracks: 0,
         partial: false,
@@ -218,6 +237,12 @@ pub(crate) fn assemble(
         Policy::Standard => assembler.run(joints),
         Policy::Paper => assembler.descend(joints),
     }
+}
+
+/// Covariance of a pose, given what a contact tells about it; what it doesn't tell is known to a scale and a radian.
+fn covariance(information: &Matrix3<f64>, scale: f64) -> Matrix3<f64> {
+    let known = Matrix3::from_diagonal(&Vector3::new(scale.powi(-2), scale.powi(-2), 1.0));
+    (information + known).try_inverse().unwrap_or_else(Matrix3::identity)
 }
 
 /// Ranks the candidates of each mouth and tab by cost.
@@ -244,8 +269,18 @@ fn median(values: &mut [f64]) -> Option<f64> {
     Some(*values.select_nth_unstable_by(middle, f64::total_cmp).1)
 }
 
+/// Median and robust deviation.
+fn spread_of(values: &mut [f64]) -> (f64, f64) {
+    let middle = median(values).unwrap_or(0.0);
+    let mut off: Vec<f64> = values.iter().map(|v| (v - middle).abs()).collect();
+    (middle, 1.48 * median(&mut off).unwrap_or(0.0))
+}
+
 impl Assembler<'_> {
     fn run(&mut self, joints: &[Joint]) -> Outcome {
+        // Of pieces that are there twice one makes the puzzle: two would take each other's place.
+        self.aside = copies(self.outlines);
+        self.model = self.first_model();
         let outstanding = self.outstanding();
         self.learn(&outstanding);
         let found = if self.params.loops { self.close_loops(joints) } else { Vec::new() };
@@ -263,6 +298,13 @@ impl Assembler<'_> {
         }
         self.reconcile();
         self.improve();
+        if self.aside.contains(&true) {
+            self.aside.fill(false);
+            self.grow();
+            self.verify();
+        }
+        self.refine_all(1, FINE);
+        self.fill();
         self.refine_all(FINAL_ROUNDS, FINE);
         self.finish_sure(joints)
     }
@@ -338,67 +380,71 @@ impl Assembler<'_> {
         self.partial
     }
 
-    fn active(&self) -> Vec<usize> {
-        (0..self.edges.len())
-            .filter(|k| self.edges[*k].mouth_rank < LOOP_RANKS && self.edges[*k].tab_rank < LOOP_RANKS)
-            .collect()
-    }
-
-    /// Finds loops twice: loosely to calibrate closure, clearance and residual, then with what was learnt.
+    /// Finds loops among the best candidates to calibrate closure, clearance and residual, then, with what was learnt,
+    /// among more. The best come first; what is more likely chance is left out.
     fn close_loops(&mut self, joints: &[Joint]) -> Vec<loops::Loop> {
-        let mut tolerance = LOOSE;
-        let active = self.active();
-        let low = |e: &Edge| e.mouth_rank < FIRST_RANKS && e.tab_rank < FIRST_RANKS;
-        let best: Vec<usize> = active.iter().copied().filter(|k| low(&self.edges[*k])).collect();
-        let first = loops::find(&self.edges, &best, self.outlines, tolerance);
-        let typical = median(&mut first.iter().map(|l| l.error).collect::<Vec<f64>>()).unwrap_or(1.0);
-        if self.params.recalibrate && (first.len() < CROWD.0 || typical > CROWD.1) {
-            return self.outstanding_loops(first);
-        }
+        self.closure = self.first_guess();
         if self.params.recalibrate {
-            let factor = (CLOSURE_FACTOR * typical).min(1.0);
-            tolerance.position = (LOOSE.position * factor).max(TIGHT.position);
-            tolerance.angle = (LOOSE.angle * factor).max(TIGHT.angle);
-            let mut supported: Vec<usize> =
-                first.iter().filter(|l| l.error <= 2.0 * typical).flat_map(|l| l.edges.iter().copied()).collect();
+            let first = self.measure_closure(FIRST_RANKS);
+            let sure = first.iter().filter(|l| l.evidence >= FOUND);
+            let mut supported: Vec<usize> = sure.flat_map(|l| l.edges.iter().copied()).collect();
             supported.sort_unstable();
             supported.dedup();
             self.calibrate(joints, &supported);
             rank(&mut self.edges);
             self.learn(&supported);
-            // Two steps of a loop err more than one; an island's drift is not known, so it may be twice that.
-            self.agree = Tolerance {
-                position: (2.0 * tolerance.position).clamp(MIN_AGREE.position, AGREE.position),
-                angle: (2.0 * tolerance.angle).clamp(MIN_AGREE.angle, AGREE.angle),
-            };
         }
-        let active = self.active();
-        let found = loops::find(&self.edges, &active, self.outlines, tolerance);
-        self.sorted(found)
+        // The fewer candidates take part, the fewer loops close by chance: those of the best ones say more.
+        let mut found: BTreeMap<Vec<usize>, loops::Loop> = BTreeMap::new();
+        for ranks in [FIRST_RANKS, LOOP_RANKS] {
+            for l in self.measure_closure(ranks) {
+                let known = found.entry(l.edges.clone()).or_insert_with(|| l.clone());
+                known.evidence = known.evidence.max(l.evidence);
+            }
+        }
+        self.sorted(found.into_values().collect())
     }
 
-    /// Loops of so few or so loose ones that they may be chance: those whose candidates lead their rivals as well.
-    fn outstanding_loops(&mut self, found: Vec<loops::Loop>) -> Vec<loops::Loop> {
-        let lead = |l: &loops::Loop| l.edges.iter().map(|k| self.lead(*k)).sum::<f64>();
-        let (kept, _) = found.into_iter().partition(|l| lead(l) >= ACCEPT);
-        self.sorted(kept)
+    /// Loops of the best candidates; how they and those of decoys close is learnt.
+    fn measure_closure(&mut self, ranks: usize) -> Vec<loops::Loop> {
+        let active: Vec<usize> = (0..self.edges.len())
+            .filter(|k| self.edges[*k].mouth_rank < ranks && self.edges[*k].tab_rank < ranks && !self.waits(*k))
+            .collect();
+        let ways = loops::Ways::new(&self.edges, &active, self.outlines, LOOSE);
+        let mut found = ways.close();
+        let decoys: Vec<loops::Decoys> = (0..DECOYS).map(|round| ways.close_decoys(round)).collect();
+        self.closure = Closure::fit(&self.first_guess(), &found, &decoys);
+        for l in &mut found {
+            l.evidence = self.closure.evidence(l.distance);
+        }
+        found
     }
 
-    /// Counts what supports what, and puts the best loops first.
-    fn sorted(&mut self, mut found: Vec<loops::Loop>) -> Vec<loops::Loop> {
-        for l in &found {
+    /// How loops should close, by the residuals of the best candidates and the tolerance of the search.
+    fn first_guess(&self) -> Closure {
+        let best = self.edges.iter().filter(|e| e.mouth_rank == 0);
+        let residual = median(&mut best.clone().map(|e| e.cost.exp()).collect::<Vec<f64>>()).unwrap_or(1.0);
+        // The box of the tolerance, in units of what four candidates leave open.
+        let open = |e: &Edge| (64.0 * e.covariance.determinant()).max(f64::MIN_POSITIVE).sqrt();
+        let open = median(&mut best.map(open).collect::<Vec<f64>>()).unwrap_or(1.0);
+        let volume = (LOOSE.position * self.scale).powi(2) * LOOSE.angle;
+        Closure::guess(STIFFNESS * residual, (volume / open).cbrt())
+    }
+
+    /// Counts what supports what, leaves out loops that are more likely chance, and puts the best first.
+    fn sorted(&mut self, found: Vec<loops::Loop>) -> Vec<loops::Loop> {
+        let value = |l: &loops::Loop| {
+            let costs = l.edges.iter().map(|k| self.model.evidence(self.edges[*k].cost).max(WORN));
+            l.evidence + costs.sum::<f64>()
+        };
+        let mut keyed: Vec<(f64, loops::Loop)> = found.into_iter().map(|l| (value(&l), l)).collect();
+        keyed.retain(|(value, l)| *value >= FOUND && l.evidence >= 0.0);
+        keyed.sort_by(|p, q| q.0.total_cmp(&p.0).then_with(|| p.1.edges.cmp(&q.1.edges)));
+        for (_, l) in &keyed {
             for &k in &l.edges {
                 self.edges[k].support += 1;
             }
         }
-        let value = |l: &loops::Loop| {
-            let cost: f64 = l.edges.iter().map(|k| self.edges[*k].cost).sum::<f64>() / l.edges.len() as f64;
-            let support: f64 =
-                l.edges.iter().map(|k| (self.edges[*k].support as f64).min(4.0)).sum::<f64>() / l.edges.len() as f64;
-            cost + 0.5 * l.error - 0.5 * support
-        };
-        let mut keyed: Vec<(f64, loops::Loop)> = found.drain(..).map(|l| (value(&l), l)).collect();
-        keyed.sort_by(|p, q| p.0.total_cmp(&q.0).then_with(|| p.1.edges.cmp(&q.1.edges)));
         keyed.into_iter().map(|(_, l)| l).collect()
     }
 
@@ -434,13 +480,17 @@ impl Assembler<'_> {
         if right.len() < FEW || wrong.len() < FEW {
             return;
         }
-        let fit = |values: &mut Vec<f64>, low: f64, high: f64| {
-            let middle = median(values).unwrap_or(0.0);
-            let mut off: Vec<f64> = values.iter().map(|v| (v - middle).abs()).collect();
-            (middle, (1.48 * median(&mut off).unwrap_or(low)).clamp(low, high))
-        };
-        // Widths: never so narrow that a good candidate looks bad, never so wide that everything looks alike.
-        self.model = Model { right: fit(&mut right, 0.15, 0.5), wrong: fit(&mut wrong, 0.2, 0.7) };
+        self.model = Model::between(spread_of(&mut right), spread_of(&mut wrong));
+    }
+
+    /// Before anything is trusted: right candidates cost what noise and sampling make them, wrong ones what the second
+    /// and third of the mouths do.
+    fn first_model(&self) -> Model {
+        let runners_up = self.edges.iter().filter(|e| (1..=2).contains(&e.mouth_rank));
+        match spread_of(&mut runners_up.map(|e| e.cost).collect::<Vec<f64>>()) {
+            (_, 0.0) => self.model,
+            wrong => Model::between(self.model.right, wrong),
+        }
     }
 
     /// Candidates that are the best of their tab and of their mouth by a wide margin: what to learn from without loops.
@@ -483,18 +533,26 @@ impl Assembler<'_> {
         self.state.island[e.a] == self.state.island[e.b]
     }
 
-    /// Whether no other mating has taken the stretch of border.
+    /// Whether one of a candidate's pieces has been set aside.
+    fn waits(&self, k: usize) -> bool {
+        self.aside[self.edges[k].a] || self.aside[self.edges[k].b]
+    }
+
+    /// Whether no other mating has taken either stretch of border, and its pieces don't wait.
     fn free(&self, k: usize) -> bool {
-        self.edges[k].slots().iter().all(|s| {
-            let outline = self.outlines[s.piece];
-            let taken = |tab: bool, count: usize| {
-                (0..count).any(|index| {
-                    let other = Slot { piece: s.piece, tab, index };
-                    self.state.used.get(&other).is_some_and(|j| *j != k) && conflict(outline, *s, other)
-                })
-            };
-            !taken(true, outline.tabs.len()) && !taken(false, outline.mouths.len())
-        })
+        !self.waits(k) && self.edges[k].slots().iter().all(|s| self.open(*s, k))
+    }
+
+    /// Whether no mating but `k` has taken an isthmus or one that claims the same stretch of border.
+    fn open(&self, slot: Slot, k: usize) -> bool {
+        let outline = self.outlines[slot.piece];
+        let taken = |tab: bool, count: usize| {
+            (0..count).any(|index| {
+                let other = Slot { piece: slot.piece, tab, index };
+                self.state.used.get(&other).is_some_and(|j| *j != k) && conflict(outline, slot, other)
+            })
+        };
+        !taken(true, outline.tabs.len()) && !taken(false, outline.mouths.len())
     }
 
     fn admissible(&self, k: usize) -> bool {
@@ -509,7 +567,9 @@ impl Assembler<'_> {
         let e = &self.edges[k];
         let actual = self.state.pose[e.b].inverse() * self.state.pose[e.a];
         let (d, turn) = difference(self.outlines[e.a], &actual, &e.b_from_a);
-        d <= self.agree.position && turn <= self.agree.angle
+        let within = |t: Tolerance| d <= t.position && turn <= t.angle;
+        within(MIN_AGREE)
+            || (within(AGREE) && self.closure.admits(loops::deviation(e, &actual, self.outlines[e.a].centroid)))
     }
 
     /// Joins the islands of a candidate; false if they contradict.
@@ -757,86 +817,85 @@ impl Assembler<'_> {
             let (ia, ib) = (self.state.island[e.a], self.state.island[e.b]);
             between.entry((ia.min(ib), ia.max(ib))).or_default().push(k);
         }
-        let mut found = Vec::new();
+        let mut grouped: BTreeMap<usize, Group> = BTreeMap::new();
         for ((low, high), candidates) in between {
             if !self.params.merge_islands && self.state.members[low].len() > 1 && self.state.members[high].len() > 1 {
                 continue;
             }
-            // Pose of the lower island in the higher.
-            let poses: Vec<Isometry2<f64>> = candidates
-                .iter()
-                .map(|k| {
-                    let e = &self.edges[*k];
-                    let b_from_a = self.state.pose[e.b] * e.b_from_a * self.state.pose[e.a].inverse();
-                    if self.state.island[e.a] == low { b_from_a } else { b_from_a.inverse() }
-                })
-                .collect();
+            let said: Vec<Said> = candidates.iter().map(|k| self.said(*k, low)).collect();
             for (i, k) in candidates.iter().enumerate() {
-                let mut group = vec![*k];
-                for (j, other) in candidates.iter().enumerate() {
-                    let e = &self.edges[*other];
-                    let piece = if self.state.island[e.a] == low { e.a } else { e.b };
-                    let (d, turn) = difference(
-                        self.outlines[piece],
-                        &(poses[i] * self.state.pose[piece]),
-                        &(poses[j] * self.state.pose[piece]),
-                    );
-                    // The turn of one joint swings what is far from it.
-                    let own = &self.edges[*k];
-                    let here = if self.state.island[own.a] == low { own.a } else { own.b };
-                    let far = (self.centre_of(here) - self.centre_of(piece)).norm() / self.scale;
-                    let slots = e.slots();
-                    let distinct = group.iter().all(|g| {
-                        self.edges[*g]
-                            .slots()
-                            .iter()
-                            .all(|s| slots.iter().all(|t| !conflict(self.outlines[s.piece], *s, *t)))
-                    });
-                    if j != i && distinct && d < AGREE.position + SWING * far && turn < AGREE.angle {
-                        group.push(*other);
-                    }
-                }
-                if let Some(evidence) = self.evidence(&group) {
-                    found.push((evidence, group));
-                }
+                grouped.insert(*k, self.group(i, low, &candidates, &said));
             }
         }
-        found
+        // A candidate must be likely by itself, and lead whatever else would take its place.
+        let acceptable = grouped.values().filter(|g| g.evidence >= ACCEPT && self.lead(g, &grouped) >= ACCEPT);
+        acceptable.map(|g| (g.evidence, g.members.clone())).collect()
     }
 
-    /// Evidence that candidates which agree on a pose are right; `None` if it isn't enough to act on.
-    fn evidence(&self, group: &[usize]) -> Option<f64> {
-        let mut sum = AGREEMENT * (group.len() - 1) as f64;
-        for &k in group {
-            // A worn joint among agreeing ones doesn't refute them.
-            sum += self.model.evidence(self.edges[k].cost).max(WORN);
-        }
-        if group.len() == 1 {
-            sum = sum.min(self.lead(group[0]));
-        }
-        (sum >= ACCEPT).then_some(sum)
-    }
-
-    /// By how much a candidate leads its free rivals for the same tab or mouth, as evidence.
-    fn lead(&self, k: usize) -> f64 {
+    /// What a candidate says about where the island `moving` lies in the other one.
+    fn said(&self, k: usize, moving: usize) -> Said<'_> {
         let e = &self.edges[k];
-        let own = self.model.evidence(e.cost);
-        let mut lead = STRONG;
-        for slot in e.slots() {
-            for &j in &self.at[slot.piece] {
-                let other = &self.edges[j];
-                if j == k
-                    || !other.slots().iter().any(|s| conflict(self.outlines[slot.piece], *s, slot))
-                    || !self.free(j)
-                {
-                    continue;
-                }
-                // Costs below the typical are alike as evidence, but between rivals the better one still leads.
-                let ahead = (own - self.model.evidence(other.cost)).max((other.cost - e.cost) / self.model.right.1);
-                lead = lead.min(ahead);
+        let b_from_a = self.state.pose[e.b] * e.b_from_a * self.state.pose[e.a].inverse();
+        let (from, pose) = if self.state.island[e.a] == moving { (e.b, b_from_a) } else { (e.a, b_from_a.inverse()) };
+        Said { edge: e, from, fixed: self.state.pose[from], pose }
+    }
+
+    /// The candidates that agree with the one at `i` on the pose of the island `moving`.
+    fn group(&self, i: usize, moving: usize, candidates: &[usize], said: &[Said]) -> Group {
+        // A worn joint among agreeing ones doesn't refute them.
+        let single = |k: usize| self.model.evidence(self.edges[k].cost).max(WORN);
+        let mut group = Group { members: vec![candidates[i]], evidence: single(candidates[i]) };
+        for (j, other) in candidates.iter().enumerate().filter(|(j, _)| *j != i) {
+            let e = &self.edges[*other];
+            let piece = if self.state.island[e.a] == moving { e.a } else { e.b };
+            let distance = loops::disagreement(&said[i], &said[j], self.centre_of(piece));
+            let slots = e.slots();
+            let clashes = |g: &usize| {
+                let taken = self.edges[*g].slots();
+                taken.iter().any(|s| slots.iter().any(|t| conflict(self.outlines[s.piece], *s, *t)))
+            };
+            if self.closure.admits(distance) && !group.members.iter().any(clashes) {
+                group.members.push(*other);
+                group.evidence += single(*other) + self.closure.agreement(distance).clamp(0.0, STRONG);
             }
         }
-        lead
+        group
+    }
+
+    /// By how much a group of candidates leads its free rivals for the same tabs and mouths, as evidence.
+    fn lead(&self, group: &Group, all: &BTreeMap<usize, Group>) -> f64 {
+        let mut lead = STRONG;
+        let mut strangers = BTreeSet::new();
+        let size = |piece: usize| self.state.members[self.state.island[piece]].len();
+        for &k in &group.members {
+            let e = &self.edges[k];
+            let largest = size(e.a).max(size(e.b));
+            for slot in e.slots() {
+                for &j in &self.at[slot.piece] {
+                    let other = &self.edges[j];
+                    if group.members.contains(&j)
+                        || !other.slots().iter().any(|s| conflict(self.outlines[slot.piece], *s, slot))
+                        || !self.free(j)
+                    {
+                        continue;
+                    }
+                    if size(slot.piece) >= largest {
+                        strangers.insert(if other.a == slot.piece { other.b } else { other.a });
+                    }
+                    let rival = all.get(&j);
+                    let evidence = rival.map_or_else(|| self.model.evidence(other.cost), |r| r.evidence);
+                    let mut ahead = group.evidence - evidence;
+                    // Costs below the typical are alike as evidence, but between rivals the better one still leads.
+                    if group.members.len() == 1 && rival.is_none_or(|r| r.members.len() == 1) {
+                        ahead = ahead.max((other.cost - e.cost) / self.model.right.1);
+                    }
+                    lead = lead.min(ahead);
+                }
+            }
+        }
+        // Candidates that agree might do so by chance, and any that vies for the same place might have been the one.
+        let tries = if group.members.len() > 1 { (1.0 + strangers.len() as f64).ln() } else { 0.0 };
+        lead.min(group.evidence - tries)
     }
 
     /// Takes out pieces that overlap others, the less supported one of a pair; islands that fall apart are split.
@@ -889,6 +948,7 @@ impl Assembler<'_> {
             .retain(|k| !matings.contains(k) && !pieces.contains(&edges[*k].a) && !pieces.contains(&edges[*k].b));
         let joined = &self.state.joined;
         self.state.used.retain(|_, k| joined.contains(k));
+        self.state.fitted.retain(|k, _| !pieces.contains(k));
         let n = self.outlines.len();
         let at = self.joined_at();
         let old = std::mem::replace(&mut self.state.members, vec![Vec::new(); n]);
@@ -1009,7 +1069,7 @@ impl Assembler<'_> {
                     alone(e.a) || alone(e.b)
                 })
                 .map(|k| (self.model.evidence(self.edges[k].cost), k))
-                .filter(|(evidence, _)| *evidence > 0.0)
+                .filter(|(evidence, _)| *evidence >= ACCEPT)
                 .collect();
             options.sort_by(|p, q| q.0.total_cmp(&p.0).then(p.1.cmp(&q.1)));
             let Some(&(_, k)) = options.first() else { return };
@@ -1072,6 +1132,9 @@ impl Assembler<'_> {
                 evidence[s.piece] += own.max(0.0) + AGREEMENT;
             }
             chosen.push(k);
+        }
+        for (k, fitted) in &self.state.fitted {
+            evidence[*k] = evidence[*k].max(fitted + AGREEMENT);
         }
         let sure = |evidence: f64| 1.0 / (1.0 + (-evidence).exp());
         for k in chosen {

@@ -104,7 +104,8 @@ pub struct JointTruth {
 /// How an assembly compares with the truth.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct Score {
-    /// Pieces that can be placed: present, face up, copies not counted.
+    /// Pieces that can be placed: present, face up, copies not counted, joined to the largest part of their puzzle that
+    /// hangs together (missing pieces may leave others without a neighbour).
     pub pieces: usize,
     /// Of these, how many lie right, counted once each, in the largest component of their puzzle.
     pub placed: usize,
@@ -210,6 +211,32 @@ impl Puzzle {
         Truth { options: self.options().clone(), pieces, joints }
     }
 
+    /// How many pieces can be placed: of each puzzle the largest part that hangs together.
+    fn placeable(&self) -> usize {
+        let lies = |k: usize| !self.pieces()[k].flipped && self.pieces()[k].duplicate_of.is_none();
+        let mut seen = vec![false; self.pieces().len()];
+        let mut largest: BTreeMap<usize, usize> = BTreeMap::new();
+        for root in 0..seen.len() {
+            if seen[root] || !lies(root) {
+                continue;
+            }
+            seen[root] = true;
+            let mut part = vec![root];
+            let mut next = 0;
+            while next < part.len() {
+                for neighbour in self.sides(part[next]).into_iter().filter_map(|side| side.neighbour) {
+                    if lies(neighbour) && !std::mem::replace(&mut seen[neighbour], true) {
+                        part.push(neighbour);
+                    }
+                }
+                next += 1;
+            }
+            let most = largest.entry(self.pieces()[root].puzzle).or_default();
+            *most = part.len().max(*most);
+        }
+        largest.values().sum()
+    }
+
     /// Joints with a neck between two pieces that lie face up, copies not counted: the piece with the tab, the one
     /// with the blank, the tab's side.
     fn joints(&self) -> Vec<(usize, usize, super::Side)> {
@@ -232,11 +259,7 @@ impl Puzzle {
         let known: Vec<Option<usize>> = pieces.iter().map(|p| index.get(p.id.as_str()).copied()).collect();
         let known = |piece: usize| known.get(piece).copied().flatten();
         let joints = self.joints();
-        let mut score = Score {
-            pieces: self.pieces().iter().filter(|p| !p.flipped && p.duplicate_of.is_none()).count(),
-            joints: joints.len(),
-            ..Score::default()
-        };
+        let mut score = Score { pieces: self.placeable(), joints: joints.len(), ..Score::default() };
 
         // Placements, component by component.
         let mut components: BTreeMap<usize, Vec<(usize, Isometry2<f64>)>> = BTreeMap::new();

@@ -1,0 +1,231 @@
+//! Filling what is left: a piece whose isthmuses alone don't decide is laid where its whole border fits best.
+//!
+//! Worn isthmuses, waves without a neck and corner pieces may have one bad candidate, or two that agree badly. For
+//! each piece left over and each candidate that leads to a free place:
+//! 1. *Settle*: the pose is adjusted to all contacts of the outlines there, the assembly held.
+//! 2. *Gap*: mean distance, clearance taken off, between the piece's border and the nearest border of the assembly,
+//!    wherever there is one near: overlap, underlap and misfit in one figure (the paper's GAP over path length).
+//! 3. *Decision*: how large that figure is for pieces that are placed, and for strangers in the same places, is
+//!    measured; a piece is placed if it fits like one of the former and leads its rivals.
+//!
+//! Complexity O(pieces left · candidates · neighbours · border). A piece that touches the assembly nowhere, or that
+//! strangers equal, stays left over.
+
+use super::{ACCEPT, Assembler, COARSE, Model, spread_of};
+use crate::posegraph::{Factor, minimise};
+use isthmus::Point;
+use nalgebra::{Isometry2, Matrix3, Translation2, UnitComplex};
+use rayon::prelude::*;
+
+/// Border farther than this from any other, in piece scales, lies open and says nothing.
+const NEAR: f64 = 0.12;
+/// Distances count at most this, in piece scales: one corner that is off shall not hide that all else fits.
+const CAP: f64 = 0.05;
+/// Part of the border near another that follows it: the rest turns away round the corners.
+const FOLLOWS: f64 = 0.75;
+/// Part of a piece's border that must have another near: less than a side says little.
+const LEAST_SHARE: f64 = 0.2;
+/// Two poses whose centroids are nearer than this, in piece scales, claim the same place.
+const SAME_PLACE: f64 = 0.3;
+/// Adjustments until a pose has settled.
+const ROUNDS: usize = 4;
+/// Placed pieces that are looked at to learn how well they fit.
+const SAMPLE: usize = 100;
+/// Strangers that are tried in the gaps, to learn how badly they fit.
+const STRANGERS: usize = 300;
+
+/// A piece in a place: by which candidate, in which pose (island from image), and how badly it fits (logarithm).
+#[derive(Debug, Clone, Copy)]
+struct Trial {
+    piece: usize,
+    edge: usize,
+    island: usize,
+    pose: Isometry2<f64>,
+    centre: Point,
+    cost: f64,
+}
+
+impl Assembler<'_> {
+    /// Places pieces left over, the best fitting first, as long as one fits like those that are placed.
+    pub(super) fn fill(&mut self) {
+        while !self.late() {
+            let trials = self.trials();
+            let Some(model) = self.fit_of_placed(&trials) else { return };
+            let best = trials.iter().filter_map(|t| {
+                let evidence = model.evidence(t.cost);
+                let lead = trials
+                    .iter()
+                    .filter(|o| (o.piece == t.piece) != self.same_place(o, t))
+                    .map(|o| evidence - model.evidence(o.cost))
+                    .fold(f64::INFINITY, f64::min);
+                (evidence.min(lead) >= ACCEPT).then_some((evidence, t))
+            });
+            let Some((evidence, trial)) = best.max_by(|p, q| p.0.total_cmp(&q.0).then(q.1.edge.cmp(&p.1.edge))) else {
+                return;
+            };
+            let trial = *trial;
+            self.place(&trial, evidence);
+        }
+    }
+
+    fn same_place(&self, p: &Trial, q: &Trial) -> bool {
+        p.island == q.island && (p.centre - q.centre).norm() < SAME_PLACE * self.scale
+    }
+
+    fn place(&mut self, trial: &Trial, evidence: f64) {
+        let alone = self.state.island[trial.piece];
+        self.state.members[alone].clear();
+        self.state.members[trial.island].push(trial.piece);
+        self.state.island[trial.piece] = trial.island;
+        self.state.pose[trial.piece] = trial.pose;
+        self.state.fitted.insert(trial.piece, evidence);
+        self.take(trial.edge);
+        // Whatever else agrees with the pose is a mating as well.
+        for k in self.at[trial.piece].clone() {
+            if self.same_island(k) && self.admissible(k) {
+                self.take(k);
+            }
+        }
+    }
+
+    /// Every piece left over in every free place that some candidate leads to; of one place the best pose.
+    fn trials(&self) -> Vec<Trial> {
+        let alone = |p: usize| self.state.members[self.state.island[p]].len() == 1;
+        let edges: Vec<(usize, usize)> = (0..self.edges.len())
+            .filter(|k| alone(self.edges[*k].a) != alone(self.edges[*k].b) && self.free(*k))
+            .map(|k| (k, if alone(self.edges[k].a) { self.edges[k].a } else { self.edges[k].b }))
+            .collect();
+        let mut trials: Vec<Trial> = edges.par_iter().filter_map(|(k, piece)| self.trial(*k, *piece)).collect();
+        trials.sort_by(|p, q| p.piece.cmp(&q.piece).then(p.cost.total_cmp(&q.cost)).then(p.edge.cmp(&q.edge)));
+        let mut kept: Vec<Trial> = Vec::new();
+        for t in trials {
+            if !kept.iter().rev().take_while(|o| o.piece == t.piece).any(|o| self.same_place(o, &t)) {
+                kept.push(t);
+            }
+        }
+        kept
+    }
+
+    /// A piece of a candidate where the other one says it belongs.
+    fn trial(&self, edge: usize, piece: usize) -> Option<Trial> {
+        let e = &self.edges[edge];
+        let (held, pose) = if piece == e.a {
+            (e.b, self.state.pose[e.b] * e.b_from_a)
+        } else {
+            (e.a, self.state.pose[e.a] * e.b_from_a.inverse())
+        };
+        let island = self.state.island[held];
+        let pose = self.settled(piece, island, pose);
+        let (cost, worst) = self.misfit(piece, island, &pose)?;
+        let centre = pose * self.outlines[piece].centroid;
+        (worst <= self.tolerated()).then_some(Trial { piece, edge, island, pose, centre, cost })
+    }
+
+    /// Pieces of an island near enough to touch a piece in a pose.
+    fn around(&self, piece: usize, island: usize, pose: &Isometry2<f64>) -> Vec<usize> {
+        let centre = pose * self.outlines[piece].centroid;
+        let reach = self.outlines[piece].radius + NEAR * self.scale;
+        let near = |q: &usize| *q != piece && (self.centre_of(*q) - centre).norm() <= reach + self.outlines[*q].radius;
+        self.state.members[island].iter().copied().filter(near).collect()
+    }
+
+    /// The pose of a piece adjusted to all contacts with an island, which is held.
+    fn settled(&self, piece: usize, island: usize, pose: Isometry2<f64>) -> Isometry2<f64> {
+        let mut settled = pose;
+        for _ in 0..ROUNDS {
+            let factors: Vec<Factor> = self
+                .around(piece, island, &settled)
+                .into_iter()
+                .filter_map(|q| {
+                    let other = self.state.pose[q];
+                    let c = self.contact_of(piece, q, &(other.inverse() * settled), COARSE)?;
+                    let mut turn = Matrix3::identity();
+                    turn.fixed_view_mut::<2, 2>(0, 0).copy_from(other.rotation.to_rotation_matrix().matrix());
+                    let (hessian, gradient) = (turn * c.hessian * turn.transpose(), turn * c.gradient);
+                    // The island is the first node, which stays where it is.
+                    Some(Factor { a: 1, b: 0, centre: other * c.centre, hessian, gradient })
+                })
+                .collect();
+            if factors.is_empty() {
+                return settled;
+            }
+            let centre = settled * self.outlines[piece].centroid;
+            let motion = minimise(&[centre, centre], &factors)[1];
+            let shift = motion.xy().cap_magnitude(CAP * self.scale);
+            let turn = UnitComplex::new(motion.z.clamp(-CAP, CAP));
+            settled = Translation2::from(centre.coords + shift) * turn * Translation2::from(-centre.coords) * settled;
+        }
+        settled
+    }
+
+    /// Logarithm of the mean gap between a piece in a pose and an island, and the greatest overlap with one of its
+    /// pieces in squared piece scales; `None` where they hardly touch.
+    fn misfit(&self, piece: usize, island: usize, pose: &Isometry2<f64>) -> Option<(f64, f64)> {
+        let outline = self.outlines[piece];
+        let stride = ((outline.scale * COARSE / outline.spacing) as usize).max(1);
+        let (near, cap) = (NEAR * self.scale, CAP * self.scale);
+        let around: Vec<(usize, Isometry2<f64>)> =
+            self.around(piece, island, pose).into_iter().map(|q| (q, self.state.pose[q].inverse() * pose)).collect();
+        let gap = |p: &Point| {
+            let gaps = around.iter().filter_map(|(q, q_from_piece)| self.outlines[*q].gap(q_from_piece * p, near));
+            gaps.min_by(|a, b| a.abs().total_cmp(&b.abs()))
+        };
+        let gaps: Vec<f64> = outline.points.iter().step_by(stride).filter_map(gap).collect();
+        if (gaps.len() as f64) < LEAST_SHARE * outline.points.len().div_ceil(stride) as f64 {
+            return None;
+        }
+        let mut gaps: Vec<f64> = gaps.into_iter().map(|g| (g - self.prior.mean).abs().min(cap)).collect();
+        gaps.sort_by(f64::total_cmp);
+        gaps.truncate((FOLLOWS * gaps.len() as f64).ceil() as usize);
+        let sum: f64 = gaps.iter().sum();
+        let worst = around
+            .iter()
+            .map(|(q, q_from_piece)| {
+                let other = self.outlines[*q];
+                self.memory.overlap(outline, other, q_from_piece) / (outline.scale * other.scale)
+            })
+            .fold(0.0, f64::max);
+        Some(((sum / gaps.len() as f64).max(1e-4).ln(), worst))
+    }
+
+    /// How badly pieces fit that are placed, and how badly strangers do in the places that are free; `None` where there
+    /// is nothing to try or nothing to learn from.
+    fn fit_of_placed(&self, trials: &[Trial]) -> Option<Model> {
+        /// Fewer placed pieces don't show how well they fit.
+        const FEW: usize = 4;
+        /// Strangers fit worse by this much (natural logarithm) if none can be tried.
+        const STRANGE: f64 = 1.0;
+        if trials.is_empty() {
+            return None;
+        }
+        let placed: Vec<usize> =
+            (0..self.outlines.len()).filter(|k| self.state.members[self.state.island[*k]].len() > FEW).collect();
+        let sample: Vec<usize> = placed.iter().copied().step_by(placed.len().div_ceil(SAMPLE).max(1)).collect();
+        let costs = |k: &usize| self.misfit(*k, self.state.island[*k], &self.state.pose[*k]).map(|(cost, _)| cost);
+        let mut right: Vec<f64> = sample.par_iter().filter_map(costs).collect();
+        if right.len() < FEW {
+            return None;
+        }
+        let right = spread_of(&mut right);
+        // Pieces that belong elsewhere, where candidates would put them among the gaps.
+        let strangers: Vec<(usize, usize)> = (0..self.edges.len())
+            .filter(|k| {
+                let e = &self.edges[*k];
+                [e.a, e.b].iter().all(|p| self.state.members[self.state.island[*p]].len() > FEW)
+            })
+            .flat_map(|k| self.edges[k].slots().map(|s| (k, s)))
+            .filter(|(k, held)| self.open(*held, *k))
+            .map(|(k, held)| (k, self.edges[k].slots().into_iter().find(|s| *s != held).map_or(0, |s| s.piece)))
+            .filter(|(k, piece)| !(self.aside[*piece] || self.same_island(*k) && self.agrees(*k)))
+            .take(STRANGERS)
+            .collect();
+        let elsewhere = |t: &Trial| {
+            t.island != self.state.island[t.piece]
+                || (t.centre - self.centre_of(t.piece)).norm() > SAME_PLACE * self.scale
+        };
+        let tried = strangers.par_iter().filter_map(|(k, piece)| self.trial(*k, *piece)).filter(elsewhere);
+        let mut wrong: Vec<f64> = tried.map(|t| t.cost).collect();
+        let wrong = if wrong.len() < FEW { (right.0 + STRANGE, right.1) } else { spread_of(&mut wrong) };
+        Some(Model::between(right, wrong))
+    }
+}
