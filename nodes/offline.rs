@@ -599,18 +599,11 @@ fn segment(segmenter: &mut Segmenter, picture: Picture) -> Result<Segmented, Str
 fn analyse(extractor: &mut Extractor, segmented: Segmented) -> Looked {
     let Segmented { name, content, frame, segmentation } = segmented;
     let source = name.source();
-    let (mut unusable, mut warnings, mut shapes) = (0, vec![], vec![]);
-    for rejected in &segmentation.rejected {
-        // Specks, hairs and glare are no pieces: nothing is lost without them.
-        let why = match rejected.reason {
-            mask::Reason::CutByFrame => "is cut by the edge of the frame",
-            mask::Reason::Touching => "is two pieces that touch",
-            _ => continue,
-        };
-        unusable += 1;
-        let mask::Aoi { x, y, width, height } = rejected.aoi;
-        warnings.push(format!("{source}: the shape of {width} x {height} px at ({x}, {y}) {why}; left out"));
-    }
+    let mut shapes = vec![];
+    let mut warnings: Vec<String> =
+        convert::left_out(&segmentation).iter().map(|what| format!("{source}: {what}")).collect();
+    let is_piece = |r: &&mask::Rejected| matches!(r.reason, mask::Reason::CutByFrame | mask::Reason::Touching);
+    let mut unusable = segmentation.rejected.iter().filter(is_piece).count();
     for cutout in segmentation.cutouts {
         match extractor.extract(&cutout) {
             Ok(features) => shapes.push((cutout, features)),

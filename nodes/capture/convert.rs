@@ -367,6 +367,24 @@ pub fn why_empty(segmentation: &mask::Segmentation) -> String {
     }
 }
 
+/// What is wrong with a segmentation, in words: pieces left out, and pieces that had to be cut apart.
+pub fn left_out(segmentation: &mask::Segmentation) -> Vec<String> {
+    let shape = |aoi: &Aoi| format!("the shape of {} x {} px at ({}, {})", aoi.width, aoi.height, aoi.x, aoi.y);
+    let rejected = segmentation.rejected.iter().filter_map(|rejected| {
+        // Specks, hairs and glare are no pieces: nothing is lost without them.
+        let why = match rejected.reason {
+            mask::Reason::CutByFrame => "is cut by the edge of the frame",
+            mask::Reason::Touching => "is two pieces that touch",
+            _ => return None,
+        };
+        Some(format!("{} {why}; left out", shape(&rejected.aoi)))
+    });
+    let separated = segmentation.separated.iter().map(|aoi| {
+        format!("{} is pieces that touch; cut apart, their borders are straight where they touched", shape(aoi))
+    });
+    rejected.chain(separated).collect()
+}
+
 /// The message of one piece.
 pub fn piece_message(id: String, picture: &FrameHead, cutout: Cutout, metres_per_pixel: f64) -> PieceImage {
     let Aoi { x, y, width, height } = cutout.window;

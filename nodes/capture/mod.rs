@@ -59,6 +59,8 @@ struct Seen {
     content: u64,
     head: FrameHead,
     cutouts: Vec<Cutout>,
+    /// What is wrong with the frame, in words.
+    left_out: Vec<String>,
 }
 
 /// The latest compressed frames, by stamp and content: one that comes through two subscriptions is worked on once.
@@ -229,6 +231,9 @@ async fn name_pieces(
 ) -> Vec<PieceImage> {
     let overlap = parameters.double(&params::SAME_PLACE_OVERLAP);
     let metres_per_pixel = parameters.double(&params::METRES_PER_PIXEL);
+    for what in &frame.left_out {
+        health.warn("left out", &format!("{}: {what}", frame.name.source()));
+    }
     let admissions = known.admit(&frame.name, frame.content, &frame.cutouts, overlap);
     let mut all = Vec::with_capacity(admissions.len());
     for (admission, cutout) in admissions.into_iter().zip(frame.cutouts) {
@@ -286,7 +291,9 @@ fn cut_out(frame: Frame) -> Result<Seen, FrameError> {
     if segmentation.cutouts.is_empty() {
         return Err(no_piece(convert::why_empty(&segmentation)));
     }
+    let left_out = convert::left_out(&segmentation);
     Ok(Seen {
+        left_out,
         name: picture.name,
         content: picture.content,
         head: FrameHead { header: picture.header, source, width, height },

@@ -65,7 +65,7 @@ pub fn inspection(id: &str, source: &str, cutout: &Cutout, features: &Features, 
     let plot_columns = plots.min(PLOT_COLUMNS) as f64;
 
     let header = 3.0 * Size::Normal.height() + 24.0;
-    let legend = 3.0 * (Size::Normal.height() + 6.0);
+    let legend = 4.0 * (Size::Normal.height() + 6.0);
     let panel = (columns * scale, (rows * scale).max(plot_rows * PLOT.1));
     let width = (panel.0 + plot_columns * (PLOT.0 + MARGIN)).max(860.0) + 2.0 * MARGIN;
     let Some(mut canvas) = Canvas::new(width, header + panel.1 + legend + 3.0 * MARGIN, WHITE) else {
@@ -310,7 +310,13 @@ fn draw_legend(canvas: &mut Canvas, at: Point, not_plotted: usize, plots: bool) 
     };
     entry(0.0, 0.0, &isthmus(VERMILLION, false), "P: positive isthmus, its ICPs");
     entry(0.0, 1.0, &isthmus(BLUE, true), "N: negative isthmus, its ICPs");
-    entry(0.0, 2.0, &across(Pen::new(GREY, 1.4).dashed(true)), "not salient; area of interest");
+    let shallow = |canvas: &mut Canvas, p: Point| {
+        let reach = Vector2::new(12.0, 0.0);
+        canvas.line([p - reach, p + reach], false, Pen::new(VERMILLION, 1.4).dashed(true));
+        [p - reach, p + reach].into_iter().for_each(|end| canvas.ring(end, 3.0, VERMILLION));
+    };
+    entry(0.0, 2.0, &shallow, "not salient: a waist of the body");
+    entry(0.0, 3.0, &across(Pen::new(GREY, 1.2).dashed(true)), "area of interest");
     entry(430.0, 0.0, &across(Pen::new(ORANGE, 1.6)), "endoskeleton (inside)");
     entry(430.0, 1.0, &across(Pen::new(SKY, 1.6)), "exoskeleton (outside)");
     entry(430.0, 2.0, &across(Pen::new(VERMILLION, 7.0).opacity(0.35)), "match segment");
