@@ -21,7 +21,7 @@ use crate::posegraph::{Factor, minimise};
 use crate::solver::Budget;
 use crate::{Params, Policy, placement};
 use nalgebra::{Isometry2, Matrix3, Point2, Translation2, UnitComplex, Vector2, Vector3};
-use std::collections::{BTreeMap, BTreeSet, HashMap};
+use std::collections::{BTreeMap, HashMap};
 
 /// Overlap of two pieces that can't be a matter of drift or clearance, in squared piece scales.
 const OVERLAP: f64 = 0.02;
@@ -865,7 +865,7 @@ impl Assembler<'_> {
     /// By how much a group of candidates leads its free rivals for the same tabs and mouths, as evidence.
     fn lead(&self, group: &Group, all: &BTreeMap<usize, Group>) -> f64 {
         let mut lead = STRONG;
-        let mut strangers = BTreeSet::new();
+        let mut strangers: BTreeMap<usize, f64> = BTreeMap::new();
         let size = |piece: usize| self.state.members[self.state.island[piece]].len();
         for &k in &group.members {
             let e = &self.edges[k];
@@ -880,7 +880,10 @@ impl Assembler<'_> {
                         continue;
                     }
                     if size(slot.piece) >= largest {
-                        strangers.insert(if other.a == slot.piece { other.b } else { other.a });
+                        let stranger = if other.a == slot.piece { other.b } else { other.a };
+                        let behind = self.model.evidence(other.cost) - self.model.evidence(e.cost).max(WORN);
+                        let chance = strangers.entry(stranger).or_default();
+                        *chance = chance.max(behind.min(0.0).exp());
                     }
                     let rival = all.get(&j);
                     let evidence = rival.map_or_else(|| self.model.evidence(other.cost), |r| r.evidence);
@@ -893,8 +896,9 @@ impl Assembler<'_> {
                 }
             }
         }
-        // Candidates that agree might do so by chance, and any that vies for the same place might have been the one.
-        let tries = if group.members.len() > 1 { (1.0 + strangers.len() as f64).ln() } else { 0.0 };
+        // Candidates that agree might do so by chance, and any that vies for the same place might have been the one,
+        // the likelier the better it fits.
+        let tries = if group.members.len() > 1 { (1.0 + strangers.values().sum::<f64>()).ln() } else { 0.0 };
         lead.min(group.evidence - tries)
     }
 
