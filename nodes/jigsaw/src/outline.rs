@@ -155,7 +155,7 @@ impl Outline {
         };
         outline.straights = outline.find_straights();
         for (index, isthmus) in piece.features.isthmuses.iter().enumerate() {
-            if !usable(isthmus) {
+            if !usable(isthmus, outline.length) {
                 continue;
             }
             let segment = outline.prepare(index, isthmus);
@@ -344,10 +344,15 @@ impl Outline {
     }
 }
 
-/// Whether the figures of an isthmus can be worked with (messages may carry anything).
-fn usable(isthmus: &Isthmus) -> bool {
+/// Whether the figures of an isthmus can be worked with (messages may carry anything): its match segment is a part of
+/// the border, longer than its chord.
+fn usable(isthmus: &Isthmus, length: f64) -> bool {
     let numbers = [isthmus.width, isthmus.path_length, isthmus.arc[0], isthmus.point.x, isthmus.point.y];
-    numbers.iter().all(|v| v.is_finite()) && isthmus.width > 0.0 && isthmus.path_length > isthmus.width
+    numbers.iter().all(|v| v.is_finite())
+        && isthmus.width > 0.0
+        && isthmus.path_length > isthmus.width
+        && isthmus.path_length <= length
+        && isthmus.arc[0].abs() <= 2.0 * length
 }
 
 /// Leading coefficients of the orthonormal cosine transform, scaled to root mean square.
