@@ -13,9 +13,9 @@ from jigsaw_msgs.msg import PieceFeatures, PieceImage
 from PIL import Image as Picture
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import CompressedImage, Image
+from test_health import Monitor
 
 from bench import BEST_EFFORT, LATCHED_PIECES, METRES_PER_PIXEL, RELIABLE, Arm, Camera, check_assembly, image_message
-from test_health import Monitor
 
 SCALE = ("-p", f"capture_node:metres_per_pixel:={METRES_PER_PIXEL}")
 FLOOD_SECONDS = float(os.environ.get("JIGSAW_FLOOD_SECONDS", "5"))  # the long run takes 60
