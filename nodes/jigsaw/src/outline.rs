@@ -250,7 +250,8 @@ impl Outline {
             })
             .collect();
         let core_from = ((first - begin) / thin) as usize;
-        let core_to = (((last - begin) / thin) as usize + 1).min(run.len());
+        // A segment shorter than the sampling ends before it begins.
+        let core_to = (((last - begin) / thin + 1).max(0) as usize).min(run.len());
         Segment {
             isthmus: index,
             origin: isthmus.point,
