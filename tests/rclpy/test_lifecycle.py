@@ -61,9 +61,13 @@ class Managed:
         self.ros.until(lambda: self.node.count_publishers(topic), f"publisher of {topic}")
 
     def services(self):
-        """The services that the graph knows as those of the node, with their types."""
-        find = self.node.get_service_names_and_types_by_node
-        return self.ros.until(lambda: dict(find(self.name, "/")), f"services of {self.name}")
+        """The services that the graph knows in the node's name, with their types."""
+        own = f"/{self.name}/"
+
+        def known():
+            return {name: kinds for name, kinds in self.node.get_service_names_and_types() if name.startswith(own)}
+
+        return self.ros.until(lambda: f"{own}get_state" in known() and known(), f"services of {self.name}")
 
     def to(self, *labels):
         for label in labels:
