@@ -18,14 +18,7 @@ cargo test --workspace --quiet || failed+=("cargo test")
 
 if wait "$venv_job"; then
     venv=$(tail -n 1 "$log")
-    # Nodes and an rclpy participant that start at the same moment don't always see all of each other (README,
-    # troubleshooting): what failed is tried again, in new processes, and what fails three times has failed.
-    pytest=("$venv/bin/python" -m pytest -o cache_dir="${venv%/*}/pytest-cache" tests/rclpy "$@")
-    "${pytest[@]}" || {
-        echo "trying again what failed"
-        again=("${pytest[@]}" --last-failed --last-failed-no-failures none)
-        "${again[@]}" || "${again[@]}" || failed+=("rclpy harness")
-    }
+    "$venv/bin/python" -m pytest -o cache_dir="${venv%/*}/pytest-cache" tests/rclpy "$@" || failed+=("rclpy harness")
 else
     cat "$log" >&2
     failed+=("tests/setup_venv.sh")

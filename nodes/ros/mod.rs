@@ -8,10 +8,12 @@
 //! | [`services`] | the six parameter services |
 //! | [`lifecycle`] | states and transitions of a managed node |
 //! | `server` | one service: requests in, answers out |
+//! | `missed` | asks a client's writer for the request that came before it was known |
 //! | [`topics`] | every topic: message type, name, quality of service |
 //! | [`raw`] | topics whose type is known by name only |
 //! | [`session`] | one node: opens topics and services as streams and sinks |
 //! | [`peers`] | discovery without multicast |
+//! | `turn` | the processes of a host open their endpoints one after the other |
 //! | [`process`] | one process: signals, participant, watchdog, exit code |
 //! | [`logging`] | log lines to the console and `/rosout`, throttled warnings |
 //! | [`health`] | counters of a node, published as `/diagnostics` |
@@ -22,6 +24,7 @@ pub mod args;
 pub mod health;
 pub mod lifecycle;
 pub mod logging;
+mod missed;
 pub mod params;
 pub mod peers;
 pub mod process;
@@ -31,3 +34,4 @@ pub mod services;
 pub mod session;
 pub mod topics;
 pub mod transforms;
+mod turn;

@@ -34,7 +34,8 @@ use super::health::Health;
 use super::lifecycle::{AUTOSTART, Activity};
 use super::params::{Default as DefaultValue, ParameterError, Parameters, Rule, Spec};
 use super::session::{Clock, Endpoints, Session, SessionError};
-use super::{logging, peers, services, topics};
+use super::turn::Turn;
+use super::{logging, missed, peers, services, topics};
 
 /// Whether the time comes from `/clock`.
 pub const USE_SIM_TIME: Spec = Spec {
@@ -206,6 +207,8 @@ pub struct Process {
     executor: Rc<smol::LocalExecutor<'static>>,
     endpoints: Endpoints,
     participant: Option<(DomainParticipant, Context)>,
+    /// Held until the endpoints are open.
+    turn: Option<Turn>,
     /// The parameters of all nodes of a composed process: one that another node has is no mistake.
     tables: &'static [&'static [Spec]],
 }
@@ -227,6 +230,7 @@ impl Process {
             executor: Rc::new(smol::LocalExecutor::new()),
             endpoints: Endpoints::default(),
             participant: None,
+            turn: None,
             tables: &[],
         })
     }
@@ -310,6 +314,9 @@ impl Process {
         if let Some((participant, _)) = &self.participant {
             self.executor.spawn(follow_discovery(participant.clone(), self.endpoints.clone())).detach();
         }
+        if let Some(turn) = self.turn.take() {
+            self.executor.spawn(turn.done()).detach();
+        }
         log::info!("{} is ready", self.name);
         let executor = Rc::clone(&self.executor);
         let result = smol::block_on(executor.run(async {
@@ -353,6 +360,7 @@ impl Process {
             log::debug!("static peers: {peers:?}");
             courier.serve(participant.guid(), peers).map_err(system)?;
         }
+        self.turn = Some(Turn::take(domain));
         let context = Context::from_domain_participant(participant.clone())
             .map_err(|e| SessionError::middleware(format!("DDS domain {domain}"), e))?;
         self.participant = Some((participant, context.clone()));
@@ -479,6 +487,13 @@ async fn follow_discovery(participant: DomainParticipant, endpoints: Endpoints) 
         match event {
             DomainParticipantStatusEvent::RemoteReaderMatched { local_writer, remote_reader } => {
                 endpoints.matched(local_writer, remote_reader);
+            }
+            DomainParticipantStatusEvent::RemoteWriterMatched { local_reader, remote_writer }
+                if endpoints.is_of_requests(local_reader) =>
+            {
+                if let Err(e) = missed::ask(&participant, local_reader, remote_writer) {
+                    log::debug!("a client was not asked for its first request: {e}");
+                }
             }
             DomainParticipantStatusEvent::ReaderLost { guid, .. } => endpoints.lost(guid),
             DomainParticipantStatusEvent::ParticipantLost { id, .. } => {

@@ -67,6 +67,7 @@ impl Session {
             .node
             .create_subscription::<Req>(&requests, None)
             .map_err(|e| SessionError::middleware(format!("service {name}"), e))?;
+        self.endpoints.opened_requests(requests.guid(), name);
         let publisher = participant.create_publisher(&policies).map_err(fail)?;
         let answers = publisher.create_datawriter_no_key(&answers, None).map_err(fail)?;
         let (sender, receiver) = mpsc::channel(CHANNEL_DEPTH);

@@ -64,6 +64,7 @@ pub(super) struct Endpoints(Arc<Mutex<EndpointTable>>);
 #[derive(Debug, Default)]
 struct EndpointTable {
     names: HashMap<GUID, String>,
+    requests: HashSet<GUID>,
     readers_of: HashMap<GUID, HashSet<GUID>>,
 }
 
@@ -74,6 +75,17 @@ impl Endpoints {
 
     fn opened(&self, endpoint: GUID, name: &str) {
         self.with(|table| table.names.insert(endpoint, name.to_owned()));
+    }
+
+    /// A reader of the requests to a service was opened.
+    pub(super) fn opened_requests(&self, endpoint: GUID, service: &str) {
+        self.opened(endpoint, service);
+        self.with(|table| table.requests.insert(endpoint));
+    }
+
+    /// Whether this reads the requests to a service.
+    pub(super) fn is_of_requests(&self, endpoint: GUID) -> bool {
+        self.with(|table| table.requests.contains(&endpoint))
     }
 
     pub(super) fn matched(&self, writer: GUID, reader: GUID) {

@@ -203,10 +203,7 @@ class Harness:
         return node
 
     def call(self, client, request, timeout=EVENT_TIMEOUT):
-        """Calls a service as soon as it is there, once, and gives its answer.
-
-        The answer takes 3 s where the node does not know the client yet; see the README.
-        """
+        """Calls a service as soon as it is there, once, and gives its answer."""
         self.until(client.service_is_ready, f"service {client.srv_name}", timeout)
         return self.result(client.call_async(request), f"answer of {client.srv_name}", timeout)
 
