@@ -16,7 +16,7 @@
 use crate::outline::{LEAST_WIDTH, Outline};
 use isthmus::Point;
 use nalgebra::{Isometry2, Matrix3, Matrix4, UnitComplex, Vector2, Vector3, Vector4};
-use std::collections::HashMap;
+use rustc_hash::FxHashMap;
 use std::sync::{Mutex, PoisonError};
 
 /// Meshes of the grid of poses along the sampling step of a contact: half a mesh off, the linearised distances err by
@@ -65,8 +65,8 @@ impl Rounded {
 #[derive(Debug, Default)]
 struct Shard {
     /// Figures with the number of the solution that asked last.
-    contacts: HashMap<Key, (u32, Option<Equations>)>,
-    overlaps: HashMap<Key, (u32, f64)>,
+    contacts: FxHashMap<Key, (u32, Option<Equations>)>,
+    overlaps: FxHashMap<Key, (u32, f64)>,
 }
 
 /// Contacts and overlaps that have been computed.

@@ -26,7 +26,7 @@ pub(crate) fn copies(outlines: &[&Outline]) -> Vec<bool> {
             }
             // A border that is off by the tolerance at every point may be longer by that share of the way round.
             let alike = (a.length - b.length).abs() <= tolerance * a.length / a.scale * LONGER;
-            if alike && overlay(a, b).is_some_and(|b_from_a| coincide(a, b, &b_from_a)) {
+            if alike && alike_in_reach(a, b) && overlay(a, b).is_some_and(|b_from_a| coincide(a, b, &b_from_a)) {
                 copy[p.max(q)] = true;
             }
         }
@@ -43,6 +43,15 @@ const OVERLAY_SAMPLES: usize = 128;
 /// noises, and what resampling adds, in pixels. Pieces that merely resemble each other differ more somewhere.
 fn sameness(a: &Outline, b: &Outline) -> f64 {
     3.0 * a.noise.hypot(b.noise) + 0.1
+}
+
+/// Whether the borders of two pieces lie equally far from their centroids, point by point in the order of distance: what
+/// copies do, however they are turned, and few others.
+fn alike_in_reach(a: &Outline, b: &Outline) -> bool {
+    /// Where few points lie between two quantiles, sampling adds this many times what the border is off.
+    const SPARSE: f64 = 3.0;
+    let tolerance = (SPARSE * sameness(a, b)) as f32;
+    a.reaches.iter().zip(&b.reaches).all(|(p, q)| (p - q).abs() <= tolerance)
 }
 
 /// The pose that lays one outline on the other best, if they are one shape.

@@ -18,7 +18,7 @@
 //! (a strip, single joints) nothing is learnt, and what is known of the borders' noise has to serve.
 
 use crate::outline::Outline;
-use crate::placement::rigid_fit;
+use crate::placement::laid_on;
 use crate::posegraph::lever;
 use isthmus::Point;
 use nalgebra::{Isometry2, Matrix3, Vector2, Vector3};
@@ -107,8 +107,13 @@ struct Way {
     via: Option<usize>,
     pose: Isometry2<f64>,
     edges: [usize; 2],
-    leaves: Slot,
-    arrives: Slot,
+}
+
+/// Where a way leads: the piece, and its centroid's place across the line on which ways are sorted.
+#[derive(Clone, Copy)]
+struct Place {
+    to: usize,
+    x: f64,
 }
 
 /// How far two poses of a piece are apart: of its centroid in piece scales, and in angle.
@@ -179,11 +184,13 @@ pub(crate) struct Ways<'a> {
     steps: Vec<Vec<Way>>,
 }
 
-/// What decoys show: distances of those that close, and how many of those come from ways that really close.
+/// What decoys show: distances of those that close, how many of those come from ways that really close, and how many
+/// sets of decoys (one of every way) were tried.
 #[derive(Debug, Clone, Default)]
 pub(crate) struct Decoys {
     distances: Vec<f64>,
     akin: usize,
+    sets: f64,
 }
 
 impl<'a> Ways<'a> {
@@ -192,10 +199,9 @@ impl<'a> Ways<'a> {
         let mut steps: Vec<Vec<Way>> = vec![Vec::new(); outlines.len()];
         for &k in active {
             let e = &edges[k];
-            let [tab, mouth] = e.slots();
-            let way = |to, pose, leaves, arrives| Way { to, via: None, pose, edges: [k, k], leaves, arrives };
-            steps[e.b].push(way(e.a, e.b_from_a, mouth, tab));
-            steps[e.a].push(way(e.b, e.b_from_a.inverse(), tab, mouth));
+            let way = |to, pose| Way { to, via: None, pose, edges: [k, k] };
+            steps[e.b].push(way(e.a, e.b_from_a));
+            steps[e.a].push(way(e.b, e.b_from_a.inverse()));
         }
         Self { edges, outlines, tolerance, steps }
     }
@@ -207,30 +213,41 @@ impl<'a> Ways<'a> {
         found.into_iter().flatten().collect()
     }
 
-    /// What would close if the piece on each way of two steps were another one; `round` makes different decoys.
-    pub(crate) fn close_decoys(&self, round: u64) -> Decoys {
+    /// What would close if the piece on each way of two steps were another one. Of large puzzles only a part is tried.
+    pub(crate) fn close_decoys(&self) -> Decoys {
         use rayon::prelude::*;
+        /// Sets of decoys at most: a few pieces have too few ways to show what chance does.
+        const SETS: u64 = 3;
+        /// Ways tried at most, about: more don't make chance better known.
+        const TRIES: f64 = 25_000.0;
         let slots: [Vec<Slot>; 2] = [false, true].map(|tab| {
             let count = |o: &Outline| if tab { o.tabs.len() } else { o.mouths.len() };
             let all = self.outlines.iter().enumerate();
             all.flat_map(|(piece, o)| (0..count(o)).map(move |index| Slot { piece, tab, index })).collect()
         });
-        let found: Vec<Decoys> =
-            (0..self.outlines.len()).into_par_iter().map(|a| self.decoys_at(a, &slots, round)).collect();
-        found.into_iter().fold(Decoys::default(), |mut all, some| {
+        // Of the ways from each piece about half lead to pieces of higher rank.
+        let ways: usize = self.steps.iter().map(|s| s.len() * s.len()).sum::<usize>() / 2;
+        let share = (TRIES / (SETS * ways.max(1) as u64) as f64).min(1.0);
+        let taken = |a: &usize| (share * (a + 1) as f64).floor() > (share * *a as f64).floor();
+        let starts: Vec<usize> = (0..self.outlines.len()).filter(taken).collect();
+        let found: Vec<Decoys> = starts.par_iter().map(|a| self.decoys_at(*a, &slots, SETS)).collect();
+        let sets = (starts.len() as u64 * SETS) as f64 / self.outlines.len().max(1) as f64;
+        found.into_iter().fold(Decoys { sets, ..Decoys::default() }, |mut all, some| {
             all.distances.extend(some.distances);
             all.akin += some.akin;
             all
         })
     }
 
-    /// Ways of one and two steps from `a` to pieces of higher rank, by where they lead.
-    fn from(&self, a: usize) -> Vec<Way> {
+    /// Ways of one and two steps from `a` to pieces of higher rank, ordered by the piece and by where they lead: compared
+    /// in this order, what is near stays near.
+    fn from(&self, a: usize) -> Vec<(Place, Way)> {
         let mut long: Vec<Way> = Vec::new();
         for first in self.steps[a].iter().filter(|w| w.to > a) {
             long.push(*first);
+            let arrives = self.arrives(first);
             for second in self.steps[first.to].iter().filter(|w| w.to > a && w.to != first.to) {
-                if conflict(self.outlines[first.to], first.arrives, second.leaves) {
+                if conflict(self.outlines[first.to], arrives, self.leaves(first.to, second)) {
                     continue;
                 }
                 long.push(Way {
@@ -238,48 +255,59 @@ impl<'a> Ways<'a> {
                     via: Some(first.to),
                     pose: first.pose * second.pose,
                     edges: [first.edges[0], second.edges[0]],
-                    leaves: first.leaves,
-                    arrives: second.arrives,
                 });
             }
         }
-        long.sort_by_key(|w| w.to);
-        long
+        let mut order: Vec<(Place, usize)> = long.iter().enumerate().map(|(k, way)| (self.place(way), k)).collect();
+        order.sort_unstable_by(|(p, i), (q, j)| {
+            p.to.cmp(&q.to).then(p.x.total_cmp(&q.x)).then_with(|| long[*i].edges.cmp(&long[*j].edges))
+        });
+        order.into_iter().map(|(place, k)| (place, long[k])).collect()
     }
 
-    /// Where a way leads, across the line on which ways are sorted.
-    fn place(&self, way: &Way) -> f64 {
-        (way.pose * self.outlines[way.to].centroid).x
+    fn place(&self, way: &Way) -> Place {
+        Place { to: way.to, x: (way.pose * self.outlines[way.to].centroid).x }
+    }
+
+    /// The isthmus by which a way leaves the piece from which it starts, and the one by which it arrives.
+    fn leaves(&self, from: usize, way: &Way) -> Slot {
+        let [tab, mouth] = self.edges[way.edges[0]].slots();
+        if tab.piece == from { tab } else { mouth }
+    }
+
+    fn arrives(&self, way: &Way) -> Slot {
+        let [tab, mouth] = self.edges[way.edges[1]].slots();
+        if tab.piece == way.to { tab } else { mouth }
+    }
+
+    /// How far apart the places of two ways to a piece may be.
+    fn reach(&self, to: usize) -> f64 {
+        self.tolerance.position * self.outlines[to].scale
     }
 
     /// The loops in which `a` has the least rank.
     fn close_at(&self, a: usize) -> Vec<Loop> {
         let mut found = Vec::new();
-        for group in self.from(a).chunk_by(|p, q| p.to == q.to) {
-            // Sorted by x the comparison stays near the diagonal.
-            let mut placed: Vec<(f64, &Way)> = group.iter().map(|w| (self.place(w), w)).collect();
-            placed.sort_by(|p, q| p.0.total_cmp(&q.0).then(p.1.edges.cmp(&q.1.edges)));
-            let reach = self.tolerance.position * self.outlines[group[0].to].scale;
-            for (i, (x, p)) in placed.iter().enumerate() {
-                let near = placed[i + 1..].iter().take_while(|(y, _)| y - x <= reach);
+        for group in self.from(a).chunk_by(|p, q| p.0.to == q.0.to) {
+            let reach = self.reach(group[0].0.to);
+            for (i, (place, p)) in group.iter().enumerate() {
+                let near = group[i + 1..].iter().take_while(|(other, _)| other.x - place.x <= reach);
                 found.extend(near.filter_map(|(_, q)| self.join(a, p, q)));
             }
         }
         found
     }
 
-    /// The decoys among the loops in which `a` has the least rank.
-    fn decoys_at(&self, a: usize, slots: &[Vec<Slot>; 2], round: u64) -> Decoys {
+    /// The decoys of some sets among the loops in which `a` has the least rank.
+    fn decoys_at(&self, a: usize, slots: &[Vec<Slot>; 2], sets: u64) -> Decoys {
         let mut found = Decoys::default();
-        for group in self.from(a).chunk_by(|p, q| p.to == q.to) {
-            let mut placed: Vec<(f64, &Way)> = group.iter().map(|w| (self.place(w), w)).collect();
-            placed.sort_by(|p, q| p.0.total_cmp(&q.0).then(p.1.edges.cmp(&q.1.edges)));
-            let reach = self.tolerance.position * self.outlines[group[0].to].scale;
-            for p in group {
-                let Some(decoy) = self.exchanged(a, p, slots, round) else { continue };
-                let x = self.place(&decoy);
-                let from = placed.partition_point(|(y, _)| *y < x - reach);
-                let near = placed[from..].iter().take_while(|(y, _)| *y <= x + reach);
+        for group in self.from(a).chunk_by(|p, q| p.0.to == q.0.to).filter(|g| g.len() > 1) {
+            let reach = self.reach(group[0].0.to);
+            for (set, (_, p)) in (0..sets).flat_map(|set| group.iter().map(move |p| (set, p))) {
+                let Some(decoy) = self.exchanged(a, p, slots, set) else { continue };
+                let x = self.place(&decoy).x;
+                let from = group.partition_point(|(place, _)| place.x < x - reach);
+                let near = group[from..].iter().take_while(|(place, _)| place.x <= x + reach);
                 for (_, q) in near.filter(|(_, q)| q.edges != p.edges) {
                     if let Some(l) = self.join(a, &decoy, q) {
                         found.distances.push(l.distance);
@@ -293,7 +321,7 @@ impl<'a> Ways<'a> {
 
     /// A way of two steps with the piece between them exchanged for some other one, which is entered and left by
     /// isthmuses of the same polarity; `None` for a single step.
-    fn exchanged(&self, a: usize, way: &Way, slots: &[Vec<Slot>; 2], round: u64) -> Option<Way> {
+    fn exchanged(&self, a: usize, way: &Way, slots: &[Vec<Slot>; 2], set: u64) -> Option<Way> {
         let via = way.via?;
         let [first, second] = way.edges.map(|k| &self.edges[k]);
         let of = |e: &Edge| e.slots().into_iter().find(|s| s.piece == via);
@@ -301,7 +329,7 @@ impl<'a> Ways<'a> {
         // Multiplication by a large odd number scatters what is looked up (Knuth 1973, Fibonacci hashing).
         let seed = [a, way.edges[0], way.edges[1]]
             .iter()
-            .fold(round + 1, |s, k| (s ^ *k as u64).wrapping_mul(0x9E37_79B9_7F4A_7C15).rotate_left(29));
+            .fold(set + 1, |s, k| (s ^ *k as u64).wrapping_mul(0x9E37_79B9_7F4A_7C15).rotate_left(29));
         let doors = &slots[usize::from(enters.tab)];
         let door = doors[(seed >> 8) as usize % doors.len()];
         let others: Vec<&Slot> = {
@@ -323,15 +351,11 @@ impl<'a> Ways<'a> {
 
     /// Pose of the piece of `other` in which its segment lies on that of `slot` best.
     fn laid(&self, slot: Slot, other: Slot) -> Option<Isometry2<f64>> {
-        /// Points of a segment that are laid on one another.
-        const POINTS: usize = 16;
-        let points = |s: Slot| -> Option<Vec<Point>> {
+        let segment = |s: Slot| {
             let o = self.outlines[s.piece];
-            let segment = if s.tab { o.tabs.get(s.index)? } else { o.mouths.get(s.index)? };
-            let part = |k: usize| segment.arc + segment.path * k as f64 / (POINTS - 1) as f64;
-            Some((0..POINTS).map(|k| o.at_arc(part(k))).collect())
+            if s.tab { o.tabs.get(s.index) } else { o.mouths.get(s.index) }
         };
-        Some(rigid_fit(&points(other)?, &points(slot)?))
+        Some(laid_on(segment(other)?, segment(slot)?))
     }
 
     /// The loop that two ways from `a` to one piece make, if they do.
@@ -345,11 +369,13 @@ impl<'a> Ways<'a> {
             _ => return None,
         };
         let outline = self.outlines[p.to];
-        if conflict(self.outlines[a], p.leaves, q.leaves) || conflict(outline, p.arrives, q.arrives) {
-            return None;
-        }
         let (d, turn) = difference(outline, &p.pose, &q.pose);
         if d > self.tolerance.position || turn > self.tolerance.angle {
+            return None;
+        }
+        if conflict(self.outlines[a], self.leaves(a, p), self.leaves(a, q))
+            || conflict(outline, self.arrives(p), self.arrives(q))
+        {
             return None;
         }
         let edges = if triangle {
@@ -361,7 +387,7 @@ impl<'a> Ways<'a> {
         let reference = p.pose * outline.centroid;
         let covariance = uncertainty(self.edges, a, p, reference) + uncertainty(self.edges, a, q, reference);
         let distance = mahalanobis(&p.pose, &q.pose, outline.centroid, &covariance);
-        Some(Loop { edges, distance, evidence: 0.0 })
+        Some(Loop { edges, distance, evidence: f64::NEG_INFINITY })
     }
 }
 
@@ -388,27 +414,27 @@ impl Closure {
 
     /// Fits the two distributions to the loops found (maximum posterior over a grid of both scales; the counts by
     /// expectation and maximisation). Decoys say beforehand how chance loops are, the guess how true ones are.
-    pub(crate) fn fit(guess: &Self, found: &[Loop], decoys: &[Decoys]) -> Self {
+    pub(crate) fn fit(guess: &Self, found: &[Loop], decoys: &Decoys) -> Self {
         /// Each scale tried is this factor wider than the one before.
-        const FINENESS: f64 = 1.25;
+        const FINENESS: f64 = 1.35;
         /// How far (natural logarithm) the guess may be off: real pieces close ten times as wide as their borders' noise.
         const GUESS_DEVIATION: f64 = 1.2;
         /// How far decoys may be off: what is among the candidates resembles the right piece more than any stranger.
         const DECOY_DEVIATION: f64 = 0.7;
         /// Decoys exchange the two pieces on the ways; any of the four of a loop may be wrong.
         const OTHERS: f64 = 2.0;
-        /// Expectation and maximisation of the counts.
+        /// Expectation and maximisation of the counts, until they change by less than this part of all.
         const STEPS: usize = 12;
+        const SETTLED: f64 = 1e-3;
         /// Loops that are looked at: more don't make the scales surer.
-        const LOOPS: usize = 400;
-        let rounds = decoys.len().max(1) as f64;
-        let mut closed: Vec<f64> = decoys.iter().flat_map(|d| d.distances.iter().copied()).collect();
+        const LOOPS: usize = 200;
+        let sets = if decoys.sets > 0.0 { decoys.sets } else { 1.0 };
+        let mut closed = decoys.distances.clone();
         closed.push(guess.wide);
         closed.sort_by(f64::total_cmp);
         let decoy_wide = closed[(closed.len() - 1) / 2] / MAXWELL_MEDIAN;
-        let expected = OTHERS * closed.len() as f64 / rounds;
-        let akin = decoys.iter().map(|d| d.akin).sum::<usize>() as f64;
-        let rate = ((akin + 1.0) / (OTHERS * rounds * found.len() as f64 + 1.0)).clamp(guess.rate, 1.0);
+        let expected = OTHERS * closed.len() as f64 / sets;
+        let rate = ((decoys.akin as f64 + 1.0) / (OTHERS * sets * found.len() as f64 + 1.0)).clamp(guess.rate, 1.0);
         let mut distances: Vec<f64> = found.iter().map(|l| l.distance).collect();
         distances.sort_by(f64::total_cmp);
         let stride = distances.len().div_ceil(LOOPS).max(1);
@@ -429,22 +455,23 @@ impl Closure {
             let right_densities = densities(narrow);
             for (wide, chance_densities) in wides.iter().filter(|w| w.0 >= LEAST_RATIO * narrow) {
                 let (mut right, mut chance) = (0.5 * distances.len() as f64, expected * share);
-                let mut sum = 0.0;
+                let densities = || right_densities.iter().zip(chance_densities);
+                let both = |right: f64, chance: f64, (f, g): (&f64, &f64)| {
+                    (right * f, (right * f + chance * g).max(f64::MIN_POSITIVE))
+                };
                 for _ in 0..STEPS {
-                    let mut among_right = 0.0;
-                    sum = 0.0;
-                    for (f, g) in right_densities.iter().zip(chance_densities) {
-                        let (f, g) = (right * f, chance * g);
-                        let both = (f + g).max(f64::MIN_POSITIVE);
-                        among_right += f / both;
-                        sum += both.ln();
-                    }
+                    let before = right;
+                    let among_right: f64 = densities().map(|d| both(right, chance, d)).map(|(f, both)| f / both).sum();
                     // The decoys' count weighs like the loops' own.
                     chance = 0.5 * (distances.len() as f64 - among_right + expected * share);
                     right = among_right;
+                    if (right - before).abs() <= SETTLED * distances.len() as f64 {
+                        break;
+                    }
                 }
                 let off =
                     |scale: f64, expected: f64, deviation: f64| 0.5 * ((scale / expected).ln() / deviation).powi(2);
+                let sum: f64 = densities().map(|d| both(right, chance, d).1.ln()).sum();
                 let value = sum
                     - right
                     - chance

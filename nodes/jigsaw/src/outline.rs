@@ -28,6 +28,9 @@ const STRAIGHT_LENGTH: f64 = 0.4;
 /// How far the border may leave its chord in such a run, in piece scales.
 const STRAIGHT_TOLERANCE: f64 = 0.006;
 
+/// Quantiles by which the distances of the border from the centroid are kept.
+const REACHES: usize = 32;
+
 /// A point with its outward normal, relative to the isthmus point.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct Node {
@@ -102,6 +105,8 @@ pub(crate) struct Outline {
     pub(crate) centroid: Point,
     /// Greatest distance of a border point from the centroid.
     pub(crate) radius: f64,
+    /// Quantiles of the distances of border points from the centroid.
+    pub(crate) reaches: [f32; REACHES],
     pub(crate) noise: f64,
     pub(crate) tabs: Vec<Segment>,
     pub(crate) mouths: Vec<Segment>,
@@ -135,7 +140,10 @@ impl Outline {
                 Vector2::new((d.y / length) as f32, (-d.x / length) as f32)
             })
             .collect();
-        let radius = points.iter().map(|p| (p - centroid).norm()).fold(0.0, f64::max);
+        let mut distances: Vec<f64> = points.iter().map(|p| (p - centroid).norm()).collect();
+        distances.sort_by(f64::total_cmp);
+        let radius = distances[n - 1];
+        let reaches = std::array::from_fn(|k| distances[(2 * k + 1) * n / (2 * REACHES)] as f32);
         let mut outline = Self {
             serial,
             raster: Raster::new(&points, area.sqrt() / RASTER_CELLS),
@@ -148,6 +156,7 @@ impl Outline {
             scale: area.sqrt(),
             centroid,
             radius,
+            reaches,
             noise: piece.features.noise.max(0.0),
             tabs: Vec::new(),
             mouths: Vec::new(),

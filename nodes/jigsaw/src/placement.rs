@@ -75,6 +75,13 @@ impl Pose {
         Self { cos: rotation.re, sin: rotation.im, x: shift.x, y: shift.y }
     }
 
+    /// Pose of the tab's piece in the image of the mouth's.
+    fn between_images(&self, tab: &Segment, mouth: &Segment) -> Isometry2<f64> {
+        let rotation = nalgebra::UnitComplex::from_cos_sin_unchecked(self.cos, self.sin);
+        let translation = mouth.origin.coords + Vector2::new(self.x, self.y) - rotation * tab.origin.coords;
+        Isometry2::from_parts(translation.into(), rotation)
+    }
+
     fn turned(&self, angle: f64, shift: Vector2<f64>) -> Self {
         let (sin, cos) = angle.sin_cos();
         let (c, s) = (cos * self.cos - sin * self.sin, sin * self.cos + cos * self.sin);
@@ -101,6 +108,11 @@ fn first_pose(tab: &Segment, mouth: &Segment) -> Pose {
     let [ax, ay] = tab.middle.map(f64::from);
     let [bx, by] = mouth.middle.map(f64::from);
     Pose { cos, sin, x: bx - cos * ax + sin * ay, y: by - sin * ax - cos * ay }
+}
+
+/// Pose of the first segment's piece in the image of the second's in which their samples lie on one another best.
+pub(crate) fn laid_on(a: &Segment, b: &Segment) -> Isometry2<f64> {
+    first_pose(a, b).between_images(a, b)
 }
 
 /// Points worked on side by side, so that the arithmetic fills vector registers.
@@ -454,10 +466,8 @@ fn figures(
         let area = f64::from(distance) * step;
         if area < 0.0 { pos_gap -= area } else { neg_gap += area }
     }
-    let rotation = nalgebra::UnitComplex::from_cos_sin_unchecked(pose.cos, pose.sin);
-    let translation = mouth.origin.coords + Vector2::new(pose.x, pose.y) - rotation * tab.origin.coords;
     Fit {
-        negative_from_positive: Isometry2::from_parts(translation.into(), rotation),
+        negative_from_positive: pose.between_images(tab, mouth),
         clearance,
         residual,
         ave_gap: feet.residual(feet.core.clone(), clearance, cap),

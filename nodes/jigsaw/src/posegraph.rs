@@ -6,7 +6,8 @@
 //! O(n log n) on the planar graph of a puzzle). The first node of each connected part stays where it is.
 
 use nalgebra::{Matrix3, Point2, Vector3};
-use std::collections::{BTreeMap, BTreeSet};
+use std::cmp::Reverse;
+use std::collections::BinaryHeap;
 
 /// A contact: the motion `d` of node `a` relative to node `b` at `centre` costs `½ dᵀ hessian d + gradientᵀ d`.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -18,9 +19,6 @@ pub(crate) struct Factor {
     pub(crate) gradient: Vector3<f64>,
 }
 
-/// An eliminated column: inverse of its pivot, and the off-diagonal blocks with their nodes.
-type Column = (Matrix3<f64>, Vec<(usize, Matrix3<f64>)>);
-
 /// Motion (x, y, turn) at a point `to` per motion of the same body at a point `from`.
 pub(crate) fn lever(from: Point2<f64>, to: Point2<f64>) -> Matrix3<f64> {
     let d = to - from;
@@ -30,73 +28,141 @@ pub(crate) fn lever(from: Point2<f64>, to: Point2<f64>) -> Matrix3<f64> {
 /// Motions (x, y, turn about the reference point) of all nodes that minimise the sum of the factors.
 pub(crate) fn minimise(references: &[Point2<f64>], factors: &[Factor]) -> Vec<Vector3<f64>> {
     let n = references.len();
-    let mut blocks: Vec<BTreeMap<usize, Matrix3<f64>>> = vec![BTreeMap::new(); n];
+    let Elimination { order, place, mut rows } = Elimination::new(n, factors);
+    // From here on nodes go by their place in the order.
+    let mut pivots = vec![Matrix3::zeros(); n];
     let mut right = vec![Vector3::zeros(); n];
     let mut weight = 0.0f64;
     for f in factors {
         let (ja, jb) = (lever(references[f.a], f.centre), lever(references[f.b], f.centre));
         let (ha, hb) = (ja.transpose() * f.hessian, jb.transpose() * f.hessian);
-        *blocks[f.a].entry(f.a).or_default() += ha * ja;
-        *blocks[f.b].entry(f.b).or_default() += hb * jb;
-        *blocks[f.a].entry(f.b).or_default() -= ha * jb;
-        *blocks[f.b].entry(f.a).or_default() -= hb * ja;
-        right[f.a] -= ja.transpose() * f.gradient;
-        right[f.b] += jb.transpose() * f.gradient;
+        let (a, b) = (place[f.a], place[f.b]);
+        pivots[a] += ha * ja;
+        pivots[b] += hb * jb;
+        let (first, second, block) = if a < b { (a, b, ha * jb) } else { (b, a, hb * ja) };
+        if let Ok(k) = rows[first].binary_search_by_key(&second, |r| r.0) {
+            rows[first][k].1 -= block;
+        }
+        right[a] -= ja.transpose() * f.gradient;
+        right[b] += jb.transpose() * f.gradient;
         weight = weight.max(f.hessian.diagonal().max());
     }
     // Gauge: the first node of each connected part is held; a trace of damping on the rest for slack contacts.
-    let mut seen = vec![false; n];
-    for root in 0..n {
-        if !seen[root] {
-            let mut stack = vec![root];
-            seen[root] = true;
-            while let Some(k) = stack.pop() {
-                for &j in blocks[k].keys() {
-                    if !seen[j] {
-                        seen[j] = true;
-                        stack.push(j);
-                    }
-                }
-            }
-            *blocks[root].entry(root).or_default() += Matrix3::identity() * (1e6 * weight.max(1.0));
-        }
-        *blocks[root].entry(root).or_default() += Matrix3::identity() * (1e-9 * weight.max(1e-9));
+    for root in roots(n, factors) {
+        pivots[place[root]] += Matrix3::identity() * (1e6 * weight.max(1.0));
     }
-    let mut queue: BTreeSet<(usize, usize)> = blocks.iter().enumerate().map(|(k, b)| (b.len(), k)).collect();
-    let mut order = Vec::with_capacity(n);
-    let mut columns: Vec<Column> = Vec::with_capacity(n);
-    while let Some((_, k)) = queue.pop_first() {
-        let mut row = std::mem::take(&mut blocks[k]);
-        let pivot = row.remove(&k).unwrap_or_default();
-        let inverse = pivot.try_inverse().unwrap_or_default();
-        let others: Vec<(usize, Matrix3<f64>)> = row.into_iter().collect();
-        for (i, _) in &others {
-            queue.remove(&(blocks[*i].len(), *i));
-        }
-        for (i, a_ki) in &others {
-            let scaled = a_ki.transpose() * inverse;
-            for (j, a_kj) in &others {
-                *blocks[*i].entry(*j).or_default() -= scaled * a_kj;
-            }
-            blocks[*i].remove(&k);
+    let damping = Matrix3::identity() * (1e-9 * weight.max(1e-9));
+    for k in 0..n {
+        let inverse = (pivots[k] + damping).try_inverse().unwrap_or_default();
+        pivots[k] = inverse;
+        let row = std::mem::take(&mut rows[k]);
+        for (at, (i, block)) in row.iter().enumerate() {
+            let scaled = block.transpose() * inverse;
+            pivots[*i] -= scaled * block;
             let pivot_right = right[k];
             right[*i] -= scaled * pivot_right;
+            // The rest of this row is among the blocks of that one; both are in order.
+            let mut others = rows[*i].iter_mut();
+            for (j, other) in &row[at + 1..] {
+                if let Some((_, fill)) = others.find(|o| o.0 == *j) {
+                    *fill -= scaled * other;
+                }
+            }
         }
-        for (i, _) in &others {
-            queue.insert((blocks[*i].len(), *i));
-        }
-        order.push(k);
-        columns.push((inverse, others));
+        rows[k] = row;
     }
     let mut motion = vec![Vector3::zeros(); n];
-    for (k, (inverse, others)) in order.into_iter().zip(columns).rev() {
-        let mut v = right[k];
-        for (j, a_kj) in others {
-            v -= a_kj * motion[j];
-        }
-        motion[k] = inverse * v;
+    for k in (0..n).rev() {
+        let sum = rows[k].iter().fold(right[k], |sum, (j, block)| sum - block * motion[order[*j]]);
+        motion[order[k]] = pivots[k] * sum;
     }
     motion
+}
+
+/// The least node of each part that factors connect.
+fn roots(n: usize, factors: &[Factor]) -> Vec<usize> {
+    let mut parts: Vec<usize> = (0..n).collect();
+    let root = |parts: &mut Vec<usize>, mut k: usize| {
+        while parts[k] != k {
+            parts[k] = parts[parts[k]];
+            k = parts[k];
+        }
+        k
+    };
+    for f in factors {
+        let (a, b) = (root(&mut parts, f.a), root(&mut parts, f.b));
+        parts[a.max(b)] = a.min(b);
+    }
+    (0..n).filter(|k| parts[*k] == *k).collect()
+}
+
+/// In which order nodes are eliminated, and between which of them blocks then stand.
+struct Elimination {
+    order: Vec<usize>,
+    /// Place of each node in the order.
+    place: Vec<usize>,
+    /// For each place the later places with a block in common, in order; the blocks are zero.
+    rows: Vec<Vec<(usize, Matrix3<f64>)>>,
+}
+
+impl Elimination {
+    fn new(n: usize, factors: &[Factor]) -> Self {
+        let mut around: Vec<Vec<usize>> = vec![Vec::new(); n];
+        for f in factors.iter().filter(|f| f.a != f.b) {
+            around[f.a].push(f.b);
+            around[f.b].push(f.a);
+        }
+        for near in &mut around {
+            near.sort_unstable();
+            near.dedup();
+        }
+        // Degrees that have changed since are skipped when their turn comes.
+        let mut queue: BinaryHeap<Reverse<(usize, usize)>> =
+            around.iter().enumerate().map(|(k, near)| Reverse((near.len(), k))).collect();
+        let (mut order, mut place) = (Vec::with_capacity(n), vec![usize::MAX; n]);
+        let mut later: Vec<Vec<usize>> = Vec::with_capacity(n);
+        let mut merged = Vec::new();
+        while let Some(Reverse((degree, k))) = queue.pop() {
+            if place[k] != usize::MAX || degree != around[k].len() {
+                continue;
+            }
+            place[k] = order.len();
+            order.push(k);
+            let near = std::mem::take(&mut around[k]);
+            for &i in &near {
+                merge(&around[i], &near, &mut merged);
+                merged.retain(|j| *j != i && *j != k);
+                std::mem::swap(&mut around[i], &mut merged);
+                queue.push(Reverse((around[i].len(), i)));
+            }
+            later.push(near);
+        }
+        let rows = later
+            .into_iter()
+            .map(|near| {
+                let mut row: Vec<(usize, Matrix3<f64>)> = near.iter().map(|j| (place[*j], Matrix3::zeros())).collect();
+                row.sort_unstable_by_key(|r| r.0);
+                row
+            })
+            .collect();
+        Self { order, place, rows }
+    }
+}
+
+/// The union of two lists in order.
+fn merge(p: &[usize], q: &[usize], union: &mut Vec<usize>) {
+    union.clear();
+    let (mut p, mut q) = (p.iter().peekable(), q.iter().peekable());
+    loop {
+        let least = match (p.peek(), q.peek()) {
+            (Some(a), Some(b)) => **a.min(b),
+            (Some(k), None) | (None, Some(k)) => **k,
+            (None, None) => return,
+        };
+        union.push(least);
+        p.next_if(|k| **k == least);
+        q.next_if(|k| **k == least);
+    }
 }
 
 #[cfg(test)]

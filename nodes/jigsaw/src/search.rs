@@ -12,6 +12,7 @@
 //!    contacts), and growth is tried again without them; a step that loses more than it brings is undone.
 
 mod fill;
+mod state;
 
 use crate::contact::{ClearancePrior, Contact, Memory};
 use crate::copies::copies;
@@ -21,6 +22,7 @@ use crate::posegraph::{Factor, minimise};
 use crate::solver::Budget;
 use crate::{Params, Policy, placement};
 use nalgebra::{Isometry2, Matrix3, Point2, Translation2, UnitComplex, Vector2, Vector3};
+use state::{Slots, State};
 use std::collections::{BTreeMap, HashMap};
 
 /// Overlap of two pieces that can't be a matter of drift or clearance, in squared piece scales.
@@ -29,8 +31,6 @@ const OVERLAP: f64 = 0.02;
 const UNREFINED_OVERLAP: f64 = 0.05;
 /// Loops of refined poses close to within this on real pieces (0.8 % and 0.44° measured); calibration tightens it.
 const LOOSE: Tolerance = Tolerance { position: 0.04, angle: 0.05 };
-/// Sets of decoys by which chance closure is measured.
-const DECOYS: u64 = 3;
 /// True loops close this many times as wide as the borders' residuals say, as a first guess: neighbouring residuals
 /// are alike (1 to 2 on generated pieces, 4 to 12 on real ones, which don't keep their shape exactly).
 const STIFFNESS: f64 = 3.0;
@@ -82,33 +82,6 @@ pub(crate) struct Outcome {
     pub(crate) confidence: Vec<f64>,
     pub(crate) backtracks: usize,
     pub(crate) partial: bool,
-}
-
-/// Islands and poses: what backtracking saves and restores.
-#[derive(Debug, Clone)]
-struct State {
-    island: Vec<usize>,
-    members: Vec<Vec<usize>>,
-    pose: Vec<Isometry2<f64>>,
-    joined: Vec<usize>,
-    used: HashMap<Slot, usize>,
-    refined: Vec<usize>,
-    /// Evidence for pieces that were placed because their whole border fits.
-    fitted: BTreeMap<usize, f64>,
-}
-
-impl State {
-    fn new(n: usize) -> Self {
-        Self {
-            island: (0..n).collect(),
-            members: (0..n).map(|k| vec![k]).collect(),
-            pose: vec![Isometry2::identity(); n],
-            joined: Vec::new(),
-            used: HashMap::new(),
-            refined: vec![1; n],
-            fitted: BTreeMap::new(),
-        }
-    }
 }
 
 /// Costs (logarithms of residuals) of right candidates, and of the best wrong one beside each: mean and deviation.
@@ -172,6 +145,7 @@ struct Assembler<'a> {
     closure: Closure,
     /// Pieces that wait: copies of others, until those are placed.
     aside: Vec<bool>,
+    slots: Slots,
     state: State,
     backtracks: usize,
     partial: bool,
@@ -207,7 +181,8 @@ pub(crate) fn assemble(
             support: 0,
         })
         .collect();
-    rank(&mut edges);
+    let slots = Slots::new(outlines);
+    rank(&mut edges, &slots);
     let mut at = vec![Vec::new(); n];
     for (k, e) in edges.iter().enumerate() {
         at[e.a].push(k);
@@ -229,7 +204,8 @@ pub(crate) fn assemble(
         },
         closure: Closure::guess(0.02, 1.0),
         aside: vec![false; n],
-        state: State::new(n),
+        state: State::new(&slots),
+        slots,
         backtracks: 0,
         partial: false,
     };
@@ -246,18 +222,15 @@ fn covariance(information: &Matrix3<f64>, scale: f64) -> Matrix3<f64> {
 }
 
 /// Ranks the candidates of each mouth and tab by cost.
-fn rank(edges: &mut [Edge]) {
+fn rank(edges: &mut [Edge], slots: &Slots) {
     let mut order: Vec<usize> = (0..edges.len()).collect();
-    order.sort_by(|p, q| edges[*p].cost.total_cmp(&edges[*q].cost).then(p.cmp(q)));
-    let mut count: HashMap<Slot, usize> = HashMap::new();
+    order.sort_unstable_by(|p, q| edges[*p].cost.total_cmp(&edges[*q].cost).then(p.cmp(q)));
+    let mut counts = vec![0; slots.count()];
     for k in order {
-        let [tab, mouth] = edges[k].slots();
-        let c = count.entry(tab).or_default();
-        edges[k].tab_rank = *c;
-        *c += 1;
-        let c = count.entry(mouth).or_default();
-        edges[k].mouth_rank = *c;
-        *c += 1;
+        let [tab, mouth] = edges[k].slots().map(|s| slots.number(s));
+        (edges[k].tab_rank, edges[k].mouth_rank) = (counts[tab], counts[mouth]);
+        counts[tab] += 1;
+        counts[mouth] += 1;
     }
 }
 
@@ -285,7 +258,7 @@ impl Assembler<'_> {
         self.learn(&outstanding);
         let found = if self.params.loops { self.close_loops(joints) } else { Vec::new() };
         self.islands(&found);
-        let trusted: Vec<usize> = self.state.joined.clone();
+        let trusted: Vec<usize> = self.state.joined().to_vec();
         self.learn(&trusted);
         self.refine_all(1, COARSE);
         self.grow();
@@ -314,12 +287,12 @@ impl Assembler<'_> {
         let least = self.params.minimum_confidence;
         let mut outcome = self.finish(joints);
         // Each round takes something out, so there are no more rounds than pieces and matings.
-        for _ in 0..self.outlines.len() + self.state.joined.len() {
+        for _ in 0..self.outlines.len() + self.state.joined().len() {
             let unsure: Vec<usize> = (0..self.outlines.len())
                 .filter(|k| outcome.poses[*k].is_some() && outcome.confidence[*k] < least)
                 .collect();
             let weak: Vec<usize> = outcome.matings.iter().filter(|m| m.1 < least).map(|m| m.0).collect();
-            let joined: Vec<usize> = weak.into_iter().filter(|k| self.state.joined.contains(k)).collect();
+            let joined: Vec<usize> = weak.into_iter().filter(|k| self.holds(*k)).collect();
             if unsure.is_empty() && joined.is_empty() {
                 break;
             }
@@ -340,14 +313,14 @@ impl Assembler<'_> {
         let mut queue = std::collections::VecDeque::from([Vec::new()]);
         let mut best: Option<(usize, State)> = None;
         while let Some(skipped) = queue.pop_front() {
-            self.state = State::new(n);
+            self.state = State::new(&self.slots);
             let mut decisions = Vec::new();
             for &k in &ranked {
                 if !skipped.contains(&k) && !self.same_island(k) && self.join(k) {
                     decisions.push(k);
                 }
             }
-            let placed = self.state.members.iter().map(Vec::len).max().unwrap_or(0);
+            let placed = self.state.largest();
             if best.as_ref().is_none_or(|b| placed > b.0) {
                 best = Some((placed, self.state.clone()));
             }
@@ -368,7 +341,7 @@ impl Assembler<'_> {
         if let Some((_, state)) = best {
             self.state = state;
         }
-        let trusted = self.state.joined.clone();
+        let trusted = self.state.joined().to_vec();
         self.learn(&trusted);
         self.finish_sure(joints)
     }
@@ -385,39 +358,47 @@ impl Assembler<'_> {
     fn close_loops(&mut self, joints: &[Joint]) -> Vec<loops::Loop> {
         self.closure = self.first_guess();
         if self.params.recalibrate {
-            let first = self.measure_closure(FIRST_RANKS);
+            let mut first = self.ways(FIRST_RANKS).close();
+            self.weigh(&mut first, FIRST_RANKS);
             let sure = first.iter().filter(|l| l.evidence >= FOUND);
             let mut supported: Vec<usize> = sure.flat_map(|l| l.edges.iter().copied()).collect();
             supported.sort_unstable();
             supported.dedup();
             self.calibrate(joints, &supported);
-            rank(&mut self.edges);
+            rank(&mut self.edges, &self.slots);
             self.learn(&supported);
         }
         // The fewer candidates take part, the fewer loops close by chance: those of the best ones say more.
-        let mut found: BTreeMap<Vec<usize>, loops::Loop> = BTreeMap::new();
+        let mut found = self.ways(LOOP_RANKS).close();
         for ranks in [FIRST_RANKS, LOOP_RANKS] {
-            for l in self.measure_closure(ranks) {
-                let known = found.entry(l.edges.clone()).or_insert_with(|| l.clone());
-                known.evidence = known.evidence.max(l.evidence);
-            }
+            let among = |l: &loops::Loop| l.edges.iter().all(|k| self.among(*k, ranks));
+            let (mut these, others): (Vec<loops::Loop>, Vec<loops::Loop>) = found.into_iter().partition(among);
+            self.weigh(&mut these, ranks);
+            these.extend(others);
+            found = these;
         }
-        self.sorted(found.into_values().collect())
+        self.sorted(found)
     }
 
-    /// Loops of the best candidates; how they and those of decoys close is learnt.
-    fn measure_closure(&mut self, ranks: usize) -> Vec<loops::Loop> {
-        let active: Vec<usize> = (0..self.edges.len())
-            .filter(|k| self.edges[*k].mouth_rank < ranks && self.edges[*k].tab_rank < ranks && !self.waits(*k))
-            .collect();
-        let ways = loops::Ways::new(&self.edges, &active, self.outlines, LOOSE);
-        let mut found = ways.close();
-        let decoys: Vec<loops::Decoys> = (0..DECOYS).map(|round| ways.close_decoys(round)).collect();
-        self.closure = Closure::fit(&self.first_guess(), &found, &decoys);
-        for l in &mut found {
-            l.evidence = self.closure.evidence(l.distance);
+    /// Whether a candidate is among so many of its mouth and of its tab, and its pieces don't wait.
+    fn among(&self, k: usize, ranks: usize) -> bool {
+        self.edges[k].mouth_rank < ranks && self.edges[k].tab_rank < ranks && !self.waits(k)
+    }
+
+    /// The ways along the best candidates.
+    fn ways(&self, ranks: usize) -> loops::Ways<'_> {
+        let active: Vec<usize> = (0..self.edges.len()).filter(|k| self.among(*k, ranks)).collect();
+        loops::Ways::new(&self.edges, &active, self.outlines, LOOSE)
+    }
+
+    /// Learns how loops of the best candidates close, and those of decoys, and gives each the evidence that follows,
+    /// unless it has more already.
+    fn weigh(&mut self, found: &mut [loops::Loop], ranks: usize) {
+        let decoys = self.ways(ranks).close_decoys();
+        self.closure = Closure::fit(&self.first_guess(), found, &decoys);
+        for l in found {
+            l.evidence = l.evidence.max(self.closure.evidence(l.distance));
         }
-        found
     }
 
     /// How loops should close, by the residuals of the best candidates and the tolerance of the search.
@@ -530,7 +511,7 @@ impl Assembler<'_> {
 
     fn same_island(&self, k: usize) -> bool {
         let e = &self.edges[k];
-        self.state.island[e.a] == self.state.island[e.b]
+        self.state.island(e.a) == self.state.island(e.b)
     }
 
     /// Whether one of a candidate's pieces has been set aside.
@@ -546,13 +527,13 @@ impl Assembler<'_> {
     /// Whether no mating but `k` has taken an isthmus or one that claims the same stretch of border.
     fn open(&self, slot: Slot, k: usize) -> bool {
         let outline = self.outlines[slot.piece];
-        let taken = |tab: bool, count: usize| {
-            (0..count).any(|index| {
-                let other = Slot { piece: slot.piece, tab, index };
-                self.state.used.get(&other).is_some_and(|j| *j != k) && conflict(outline, slot, other)
-            })
-        };
-        !taken(true, outline.tabs.len()) && !taken(false, outline.mouths.len())
+        let taken = |other: &Slot| self.state.mating_at(self.slots.number(*other)).is_some_and(|j| j != k);
+        !self.slots.of(slot.piece).any(|other| taken(&other) && conflict(outline, slot, other))
+    }
+
+    /// Whether a candidate is a mating.
+    fn holds(&self, k: usize) -> bool {
+        self.state.mating_at(self.slots.number(self.edges[k].slots()[0])) == Some(k)
     }
 
     fn admissible(&self, k: usize) -> bool {
@@ -582,7 +563,7 @@ impl Assembler<'_> {
             return true;
         }
         let e = &self.edges[k];
-        let (ia, ib) = (self.state.island[e.a], self.state.island[e.b]);
+        let (ia, ib) = (self.state.island(e.a), self.state.island(e.b));
         let b_from_a = self.state.pose[e.b] * e.b_from_a * self.state.pose[e.a].inverse();
         if !self.merge(ia, ib, &b_from_a) {
             return false;
@@ -604,7 +585,7 @@ impl Assembler<'_> {
     /// The islands that some candidates would join, and the pose of the first in the second that suits them best.
     fn common_pose(&self, members: &[usize]) -> (usize, usize, Isometry2<f64>) {
         let first = &self.edges[members[0]];
-        let (ia, ib) = (self.state.island[first.a], self.state.island[first.b]);
+        let (ia, ib) = (self.state.island(first.a), self.state.island(first.b));
         let (mut here, mut there) = (Vec::new(), Vec::new());
         for &k in members {
             let e = &self.edges[k];
@@ -612,7 +593,7 @@ impl Assembler<'_> {
             for (dx, dy) in [(0.3, 0.0), (-0.3, 0.0), (0.0, 0.3), (0.0, -0.3)] {
                 let p = centre + Vector2::new(dx, dy) * self.scale;
                 let (in_a, in_b) = (self.state.pose[e.a] * p, self.state.pose[e.b] * (e.b_from_a * p));
-                let forward = self.state.island[e.a] == ia;
+                let forward = self.state.island(e.a) == ia;
                 here.push(if forward { in_a } else { in_b });
                 there.push(if forward { in_b } else { in_a });
             }
@@ -626,12 +607,8 @@ impl Assembler<'_> {
     }
 
     fn take(&mut self, k: usize) {
-        for s in self.edges[k].slots() {
-            self.state.used.insert(s, k);
-        }
-        if !self.state.joined.contains(&k) {
-            self.state.joined.push(k);
-        }
+        let slots = self.edges[k].slots().map(|s| self.slots.number(s));
+        self.state.take(k, slots);
     }
 
     /// Moves the smaller of two islands into the frame of the other, unless they overlap.
@@ -639,25 +616,21 @@ impl Assembler<'_> {
         if self.islands_overlap(ia, ib, b_from_a) > self.tolerated() {
             return false;
         }
-        let (from, to, motion) = if self.state.members[ia].len() <= self.state.members[ib].len() {
-            (ia, ib, *b_from_a)
-        } else {
-            (ib, ia, b_from_a.inverse())
-        };
-        let moved = std::mem::take(&mut self.state.members[from]);
-        for &k in &moved {
+        let (from, to, motion) =
+            if self.state.size(ia) <= self.state.size(ib) { (ia, ib, *b_from_a) } else { (ib, ia, b_from_a.inverse()) };
+        let moved: Vec<usize> = self.state.members(from).collect();
+        for k in moved {
             self.state.pose[k] = motion * self.state.pose[k];
-            self.state.island[k] = to;
         }
-        self.state.members[to].extend(moved);
+        self.state.unite(from, to);
         // Drift grows with the way through the island; adjusting at every doubling keeps it small at little cost.
-        let size = self.state.members[to].len();
+        let size = self.state.size(to);
         if self.params.pose_graph
             && self.params.policy == Policy::Standard
             && size >= 6
-            && size >= 3 * self.state.refined[to].max(2) / 2
+            && size >= 3 * self.state.adjusted[to].max(2) / 2
         {
-            self.state.refined[to] = size;
+            self.state.adjusted[to] = size;
             self.adjust(to, COARSE);
         }
         true
@@ -671,10 +644,10 @@ impl Assembler<'_> {
     /// Greatest overlap of two pieces of different islands, in squared piece scales.
     fn islands_overlap(&self, ia: usize, ib: usize, b_from_a: &Isometry2<f64>) -> f64 {
         let mut worst = 0.0f64;
-        for &p in &self.state.members[ia] {
+        for p in self.state.members(ia) {
             let pose = b_from_a * self.state.pose[p];
             let centre = pose * self.outlines[p].centroid;
-            for &q in &self.state.members[ib] {
+            for q in self.state.members(ib) {
                 let reach = self.outlines[p].radius + self.outlines[q].radius;
                 let other = self.state.pose[q] * self.outlines[q].centroid;
                 if (centre - other).norm_squared() > reach * reach {
@@ -693,11 +666,11 @@ impl Assembler<'_> {
 
     /// Pairs of pieces of one island near enough to touch.
     fn neighbours(&self, island: usize) -> Vec<(usize, usize)> {
-        let members = &self.state.members[island];
+        let members = || self.state.members(island);
         let mut placed: Vec<(f64, f64, usize)> =
-            members.iter().map(|k| (self.centre_of(*k), *k)).map(|(c, k)| (c.x, c.y, k)).collect();
+            members().map(|k| (self.centre_of(k), k)).map(|(c, k)| (c.x, c.y, k)).collect();
         placed.sort_by(|p, q| p.0.total_cmp(&q.0));
-        let reach = 2.0 * members.iter().map(|k| self.outlines[*k].radius).fold(0.0, f64::max);
+        let reach = 2.0 * members().map(|k| self.outlines[k].radius).fold(0.0, f64::max);
         let mut pairs = Vec::new();
         // A sweep along x: only what is within reach there is compared.
         for (i, (x, y, p)) in placed.iter().enumerate() {
@@ -717,7 +690,7 @@ impl Assembler<'_> {
 
     /// Adjusts all poses of an island to all contacts of its outlines.
     fn adjust(&mut self, island: usize, step: f64) {
-        let members = self.state.members[island].clone();
+        let members: Vec<usize> = self.state.members(island).collect();
         if members.len() < 2 {
             return;
         }
@@ -766,11 +739,10 @@ impl Assembler<'_> {
         if !self.params.pose_graph {
             return;
         }
-        for island in 0..self.state.members.len() {
-            if self.state.members[island].len() > 1 {
-                for _ in 0..rounds {
-                    self.adjust(island, step);
-                }
+        let islands: Vec<usize> = self.state.islands().filter(|k| !self.state.alone(*k)).collect();
+        for island in islands {
+            for _ in 0..rounds {
+                self.adjust(island, step);
             }
         }
     }
@@ -814,12 +786,12 @@ impl Assembler<'_> {
             if e.mouth_rank.min(e.tab_rank) >= GROWTH_RANKS || self.same_island(k) || !self.free(k) {
                 continue;
             }
-            let (ia, ib) = (self.state.island[e.a], self.state.island[e.b]);
+            let (ia, ib) = (self.state.island(e.a), self.state.island(e.b));
             between.entry((ia.min(ib), ia.max(ib))).or_default().push(k);
         }
         let mut grouped: BTreeMap<usize, Group> = BTreeMap::new();
         for ((low, high), candidates) in between {
-            if !self.params.merge_islands && self.state.members[low].len() > 1 && self.state.members[high].len() > 1 {
+            if !self.params.merge_islands && !self.state.alone(low) && !self.state.alone(high) {
                 continue;
             }
             let said: Vec<Said> = candidates.iter().map(|k| self.said(*k, low)).collect();
@@ -836,7 +808,7 @@ impl Assembler<'_> {
     fn said(&self, k: usize, moving: usize) -> Said<'_> {
         let e = &self.edges[k];
         let b_from_a = self.state.pose[e.b] * e.b_from_a * self.state.pose[e.a].inverse();
-        let (from, pose) = if self.state.island[e.a] == moving { (e.b, b_from_a) } else { (e.a, b_from_a.inverse()) };
+        let (from, pose) = if self.state.island(e.a) == moving { (e.b, b_from_a) } else { (e.a, b_from_a.inverse()) };
         Said { edge: e, from, fixed: self.state.pose[from], pose }
     }
 
@@ -847,7 +819,7 @@ impl Assembler<'_> {
         let mut group = Group { members: vec![candidates[i]], evidence: single(candidates[i]) };
         for (j, other) in candidates.iter().enumerate().filter(|(j, _)| *j != i) {
             let e = &self.edges[*other];
-            let piece = if self.state.island[e.a] == moving { e.a } else { e.b };
+            let piece = if self.state.island(e.a) == moving { e.a } else { e.b };
             let distance = loops::disagreement(&said[i], &said[j], self.centre_of(piece));
             let slots = e.slots();
             let clashes = |g: &usize| {
@@ -866,7 +838,7 @@ impl Assembler<'_> {
     fn lead(&self, group: &Group, all: &BTreeMap<usize, Group>) -> f64 {
         let mut lead = STRONG;
         let mut strangers: BTreeMap<usize, f64> = BTreeMap::new();
-        let size = |piece: usize| self.state.members[self.state.island[piece]].len();
+        let size = |piece: usize| self.state.size(piece);
         for &k in &group.members {
             let e = &self.edges[k];
             let largest = size(e.a).max(size(e.b));
@@ -909,7 +881,7 @@ impl Assembler<'_> {
         for _ in 0..4 {
             let mut evict: Vec<usize> = Vec::new();
             let joined = self.joined_at();
-            for island in 0..self.state.members.len() {
+            for island in self.state.islands() {
                 for (p, q) in self.neighbours(island) {
                     let pose = self.state.pose[q].inverse() * self.state.pose[p];
                     let area = self.memory.overlap(self.outlines[p], self.outlines[q], &pose);
@@ -923,7 +895,7 @@ impl Assembler<'_> {
                 }
             }
             // Matings that the adjusted poses contradict hold nothing.
-            let broken: Vec<usize> = self.state.joined.iter().copied().filter(|k| !self.agrees(*k)).collect();
+            let broken: Vec<usize> = self.state.joined().iter().copied().filter(|k| !self.agrees(*k)).collect();
             if evict.is_empty() && broken.is_empty() {
                 break;
             }
@@ -937,7 +909,7 @@ impl Assembler<'_> {
     /// Joined candidates at each piece.
     fn joined_at(&self) -> Vec<Vec<usize>> {
         let mut joined = vec![Vec::new(); self.outlines.len()];
-        for &k in &self.state.joined {
+        for &k in self.state.joined() {
             joined[self.edges[k].a].push(k);
             joined[self.edges[k].b].push(k);
         }
@@ -946,43 +918,10 @@ impl Assembler<'_> {
 
     /// Undoes all matings of some pieces and some more matings; what no longer hangs together becomes islands apart.
     fn detach(&mut self, pieces: &[usize], matings: &[usize]) {
+        let gone = |p: &usize| pieces.contains(p);
+        self.state.fitted.retain(|k, _| !gone(k));
         let edges = &self.edges;
-        self.state
-            .joined
-            .retain(|k| !matings.contains(k) && !pieces.contains(&edges[*k].a) && !pieces.contains(&edges[*k].b));
-        let joined = &self.state.joined;
-        self.state.used.retain(|_, k| joined.contains(k));
-        self.state.fitted.retain(|k, _| !pieces.contains(k));
-        let n = self.outlines.len();
-        let at = self.joined_at();
-        let old = std::mem::replace(&mut self.state.members, vec![Vec::new(); n]);
-        let mut seen = vec![false; n];
-        for members in old {
-            for &root in &members {
-                if seen[root] {
-                    continue;
-                }
-                let mut part = vec![root];
-                seen[root] = true;
-                let mut next = 0;
-                while next < part.len() {
-                    for &k in &at[part[next]] {
-                        for piece in [self.edges[k].a, self.edges[k].b] {
-                            if !seen[piece] {
-                                seen[piece] = true;
-                                part.push(piece);
-                            }
-                        }
-                    }
-                    next += 1;
-                }
-                for &k in &part {
-                    self.state.island[k] = root;
-                }
-                self.state.refined[root] = part.len();
-                self.state.members[root] = part;
-            }
-        }
+        self.state.keep(edges, |k| !matings.contains(&k) && !gone(&edges[k].a) && !gone(&edges[k].b));
     }
 
     /// Islands that fit together but for a few pieces of one that lie where pieces of the other lie already (copies, or
@@ -996,7 +935,7 @@ impl Assembler<'_> {
             let mut hypotheses = self.hypotheses();
             hypotheses.retain(|(_, group)| {
                 let e = &self.edges[group[0]];
-                let size = |p: usize| self.state.members[self.state.island[p]].len();
+                let size = |p: usize| self.state.size(p);
                 size(e.a).min(size(e.b)) > 1 && !tried.contains(group)
             });
             hypotheses.sort_by(|p, q| q.0.total_cmp(&p.0).then_with(|| p.1.cmp(&q.1)));
@@ -1039,9 +978,9 @@ impl Assembler<'_> {
         let weight =
             |k: usize| joined[k].iter().map(|j| AGREEMENT + self.model.evidence(self.edges[*j].cost)).sum::<f64>();
         let mut losers = Vec::new();
-        for &p in &self.state.members[ia] {
+        for p in self.state.members(ia) {
             let here = pose * self.state.pose[p];
-            for &q in &self.state.members[ib] {
+            for q in self.state.members(ib) {
                 let q_from_p = self.state.pose[q].inverse() * here;
                 let area = self.memory.overlap(self.outlines[p], self.outlines[q], &q_from_p);
                 if area > self.tolerated() * self.outlines[p].scale * self.outlines[q].scale {
@@ -1051,13 +990,13 @@ impl Assembler<'_> {
         }
         losers.sort_unstable();
         losers.dedup();
-        let smaller = self.state.members[ia].len().min(self.state.members[ib].len());
+        let smaller = self.state.size(ia).min(self.state.size(ib));
         if losers.len() * EXCEPTIONS > smaller { Vec::new() } else { losers }
     }
 
     /// What the assembly is worth: the evidence of its matings.
     fn worth(&self) -> f64 {
-        self.state.joined.iter().map(|k| AGREEMENT + self.model.evidence(self.edges[*k].cost)).sum()
+        self.state.joined().iter().map(|k| AGREEMENT + self.model.evidence(self.edges[*k].cost)).sum()
     }
 
     /// Backtracking: a piece left over that would fit where another sits is tried in its place; what is worth less
@@ -1069,8 +1008,7 @@ impl Assembler<'_> {
                 .filter(|k| !tried.contains(k) && !self.same_island(*k) && !self.free(*k))
                 .filter(|k| {
                     let e = &self.edges[*k];
-                    let alone = |p: usize| self.state.members[self.state.island[p]].len() == 1;
-                    alone(e.a) || alone(e.b)
+                    self.state.alone(e.a) || self.state.alone(e.b)
                 })
                 .map(|k| (self.model.evidence(self.edges[k].cost), k))
                 .filter(|(evidence, _)| *evidence >= ACCEPT)
@@ -1085,11 +1023,10 @@ impl Assembler<'_> {
             let before = self.worth();
             let mut occupants = Vec::new();
             for slot in self.edges[k].slots() {
-                for (other, j) in &self.state.used {
-                    if conflict(self.outlines[slot.piece], *other, slot) {
-                        let e = &self.edges[*j];
-                        occupants.push(if e.a == slot.piece { e.b } else { e.a });
-                    }
+                let near = self.slots.of(slot.piece).filter(|s| conflict(self.outlines[slot.piece], *s, slot));
+                for j in near.filter_map(|s| self.state.mating_at(self.slots.number(s))) {
+                    let e = &self.edges[j];
+                    occupants.push(if e.a == slot.piece { e.b } else { e.a });
                 }
             }
             occupants.sort_unstable();
@@ -1113,13 +1050,13 @@ impl Assembler<'_> {
         let paper = self.params.policy == Policy::Paper;
         // Unrefined poses contradict each other too much to recognise contacts that weren't decided on.
         let mut order: Vec<usize> = if paper {
-            self.state.joined.clone()
+            self.state.joined().to_vec()
         } else {
             (0..self.edges.len()).filter(|k| self.same_island(*k) && self.agrees(*k)).collect()
         };
-        let largest = self.state.members.iter().map(Vec::len).max().unwrap_or(0);
+        let largest = self.state.largest();
         let stray = if paper { 1 } else { (largest / STRAY_SHARE).clamp(1, STRAY) };
-        order.retain(|k| self.state.members[self.state.island[self.edges[*k].a]].len() > stray);
+        order.retain(|k| self.state.size(self.edges[*k].a) > stray);
         order.sort_by(|p, q| joints[*p].fit.residual.total_cmp(&joints[*q].fit.residual).then(p.cmp(q)));
         // Contacts that agree with a piece's pose: each beyond the first confirms it.
         let mut evidence = vec![0.0f64; n];
@@ -1150,10 +1087,7 @@ impl Assembler<'_> {
         let confidence: Vec<f64> = evidence.iter().map(|e| sure((e - AGREEMENT).max(0.0))).collect();
         Outcome {
             poses: (0..n)
-                .map(|k| {
-                    let island = self.state.island[k];
-                    (self.state.members[island].len() > stray).then(|| (island, self.state.pose[k]))
-                })
+                .map(|k| (self.state.size(k) > stray).then(|| (self.state.island(k), self.state.pose[k])))
                 .collect(),
             support: self.edges.iter().map(|e| e.support).collect(),
             matings,

@@ -376,7 +376,9 @@ impl Solver {
             }
             entries
         };
-        let all = Index::new(entries(&mut (0..outlines.len())));
+        // Where no mouth is new nobody asks for all tabs.
+        let offered = if lists.iter().all(|(current, _)| *current) { 0 } else { outlines.len() };
+        let all = Index::new(entries(&mut (0..offered)));
         let new = Index::new(entries(&mut (0..outlines.len()).filter(|k| !self.kept[*k].offered)));
         let most = self.params.candidates;
         let free = self.params.fit_clearance;

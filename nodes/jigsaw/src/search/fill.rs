@@ -73,10 +73,7 @@ impl Assembler<'_> {
     }
 
     fn place(&mut self, trial: &Trial, evidence: f64) {
-        let alone = self.state.island[trial.piece];
-        self.state.members[alone].clear();
-        self.state.members[trial.island].push(trial.piece);
-        self.state.island[trial.piece] = trial.island;
+        self.state.unite(trial.piece, trial.island);
         self.state.pose[trial.piece] = trial.pose;
         self.state.fitted.insert(trial.piece, evidence);
         self.take(trial.edge);
@@ -90,7 +87,7 @@ impl Assembler<'_> {
 
     /// Every piece left over in every free place that some candidate leads to; of one place the best pose.
     fn trials(&self) -> Vec<Trial> {
-        let alone = |p: usize| self.state.members[self.state.island[p]].len() == 1;
+        let alone = |p: usize| self.state.alone(p);
         let edges: Vec<(usize, usize)> = (0..self.edges.len())
             .filter(|k| alone(self.edges[*k].a) != alone(self.edges[*k].b) && self.free(*k))
             .map(|k| (k, if alone(self.edges[k].a) { self.edges[k].a } else { self.edges[k].b }))
@@ -114,7 +111,7 @@ impl Assembler<'_> {
         } else {
             (e.a, self.state.pose[e.a] * e.b_from_a.inverse())
         };
-        let island = self.state.island[held];
+        let island = self.state.island(held);
         let pose = self.settled(piece, island, pose);
         let (cost, worst) = self.misfit(piece, island, &pose)?;
         let centre = pose * self.outlines[piece].centroid;
@@ -126,7 +123,7 @@ impl Assembler<'_> {
         let centre = pose * self.outlines[piece].centroid;
         let reach = self.outlines[piece].radius + NEAR * self.scale;
         let near = |q: &usize| *q != piece && (self.centre_of(*q) - centre).norm() <= reach + self.outlines[*q].radius;
-        self.state.members[island].iter().copied().filter(near).collect()
+        self.state.members(island).filter(near).collect()
     }
 
     /// The pose of a piece adjusted to all contacts with an island, which is held.
@@ -198,10 +195,9 @@ impl Assembler<'_> {
         if trials.is_empty() {
             return None;
         }
-        let placed: Vec<usize> =
-            (0..self.outlines.len()).filter(|k| self.state.members[self.state.island[*k]].len() > FEW).collect();
+        let placed: Vec<usize> = (0..self.outlines.len()).filter(|k| self.state.size(*k) > FEW).collect();
         let sample: Vec<usize> = placed.iter().copied().step_by(placed.len().div_ceil(SAMPLE).max(1)).collect();
-        let costs = |k: &usize| self.misfit(*k, self.state.island[*k], &self.state.pose[*k]).map(|(cost, _)| cost);
+        let costs = |k: &usize| self.misfit(*k, self.state.island(*k), &self.state.pose[*k]).map(|(cost, _)| cost);
         let mut right: Vec<f64> = sample.par_iter().filter_map(costs).collect();
         if right.len() < FEW {
             return None;
@@ -211,7 +207,7 @@ impl Assembler<'_> {
         let strangers: Vec<(usize, usize)> = (0..self.edges.len())
             .filter(|k| {
                 let e = &self.edges[*k];
-                [e.a, e.b].iter().all(|p| self.state.members[self.state.island[*p]].len() > FEW)
+                [e.a, e.b].iter().all(|p| self.state.size(*p) > FEW)
             })
             .flat_map(|k| self.edges[k].slots().map(|s| (k, s)))
             .filter(|(k, held)| self.open(*held, *k))
@@ -220,7 +216,7 @@ impl Assembler<'_> {
             .take(STRANGERS)
             .collect();
         let elsewhere = |t: &Trial| {
-            t.island != self.state.island[t.piece]
+            t.island != self.state.island(t.piece)
                 || (t.centre - self.centre_of(t.piece)).norm() > SAME_PLACE * self.scale
         };
         let tried = strangers.par_iter().filter_map(|(k, piece)| self.trial(*k, *piece)).filter(elsewhere);

@@ -1,0 +1,168 @@
+//! What a search changes and takes back: islands of pieces, their poses, and the matings on which these rest.
+//!
+//! Islands are disjoint sets whose members form a ring, so that two are united by exchanging two links, whatever their
+//! sizes, and a whole state is a few flat vectors: to save one before a step that may be undone is one copy of each.
+
+use crate::loops::{Edge, Slot};
+use crate::outline::Outline;
+use nalgebra::Isometry2;
+use std::collections::BTreeMap;
+
+/// Islands, poses and matings.
+#[derive(Debug, Clone)]
+pub(super) struct State {
+    /// Island of each piece: one of its members.
+    island: Vec<usize>,
+    /// The next member of its island, in a ring.
+    next: Vec<usize>,
+    /// Members of the island of that number.
+    size: Vec<usize>,
+    /// Pose of each piece in its island (island from image).
+    pub(super) pose: Vec<Isometry2<f64>>,
+    /// Size of each island when its poses were adjusted last.
+    pub(super) adjusted: Vec<usize>,
+    /// Candidates that are matings, in the order in which they were taken.
+    joined: Vec<usize>,
+    /// The mating at each isthmus, by [`Slots::number`].
+    used: Vec<Option<usize>>,
+    /// Evidence for pieces that were placed because their whole border fits.
+    pub(super) fitted: BTreeMap<usize, f64>,
+}
+
+impl State {
+    pub(super) fn new(slots: &Slots) -> Self {
+        let n = slots.first.len();
+        Self {
+            island: (0..n).collect(),
+            next: (0..n).collect(),
+            size: vec![1; n],
+            pose: vec![Isometry2::identity(); n],
+            adjusted: vec![1; n],
+            joined: Vec::new(),
+            used: vec![None; slots.count],
+            fitted: BTreeMap::new(),
+        }
+    }
+
+    /// Island of a piece.
+    pub(super) fn island(&self, piece: usize) -> usize {
+        self.island[piece]
+    }
+
+    /// How many pieces the island of a piece has.
+    pub(super) fn size(&self, piece: usize) -> usize {
+        self.size[self.island[piece]]
+    }
+
+    /// Whether a piece is an island by itself.
+    pub(super) fn alone(&self, piece: usize) -> bool {
+        self.size(piece) == 1
+    }
+
+    /// All islands.
+    pub(super) fn islands(&self) -> impl Iterator<Item = usize> {
+        (0..self.island.len()).filter(|k| self.island[*k] == *k)
+    }
+
+    /// Pieces of an island, itself first.
+    pub(super) fn members(&self, island: usize) -> impl Iterator<Item = usize> {
+        let rest = std::iter::successors(Some(self.next[island]), |k| Some(self.next[*k]));
+        std::iter::once(island).chain(rest.take_while(move |k| *k != island))
+    }
+
+    /// Size of the largest island.
+    pub(super) fn largest(&self) -> usize {
+        self.islands().map(|k| self.size[k]).max().unwrap_or(0)
+    }
+
+    /// Makes the members of one island members of another; their poses are the caller's.
+    pub(super) fn unite(&mut self, from: usize, to: usize) {
+        let mut k = from;
+        loop {
+            self.island[k] = to;
+            k = self.next[k];
+            if k == from {
+                break;
+            }
+        }
+        self.next.swap(from, to);
+        self.size[to] += std::mem::take(&mut self.size[from]);
+    }
+
+    /// Candidates that are matings, in the order in which they were taken.
+    pub(super) fn joined(&self) -> &[usize] {
+        &self.joined
+    }
+
+    /// The mating at an isthmus, by its number.
+    pub(super) fn mating_at(&self, slot: usize) -> Option<usize> {
+        self.used[slot]
+    }
+
+    /// Takes a candidate as a mating of two isthmuses.
+    pub(super) fn take(&mut self, candidate: usize, slots: [usize; 2]) {
+        if slots.iter().any(|s| self.used[*s] != Some(candidate)) {
+            self.joined.push(candidate);
+        }
+        slots.into_iter().for_each(|s| self.used[s] = Some(candidate));
+    }
+
+    /// Keeps some of the matings only; what no longer hangs together becomes islands apart.
+    pub(super) fn keep(&mut self, edges: &[Edge], stays: impl Fn(usize) -> bool) {
+        self.joined.retain(|k| stays(*k));
+        for used in &mut self.used {
+            *used = used.filter(|k| stays(*k));
+        }
+        for k in 0..self.island.len() {
+            (self.island[k], self.next[k], self.size[k]) = (k, k, 1);
+        }
+        for k in std::mem::take(&mut self.joined) {
+            let (a, b) = (self.island[edges[k].a], self.island[edges[k].b]);
+            if a != b {
+                let (from, to) = if self.size[a] <= self.size[b] { (a, b) } else { (b, a) };
+                self.unite(from, to);
+            }
+            self.joined.push(k);
+        }
+        self.adjusted.copy_from_slice(&self.size);
+    }
+}
+
+/// Numbers of all isthmuses, those of a piece one after the other, tabs first.
+#[derive(Debug, Clone)]
+pub(super) struct Slots {
+    first: Vec<usize>,
+    tabs: Vec<usize>,
+    count: usize,
+}
+
+impl Slots {
+    pub(super) fn new(outlines: &[&Outline]) -> Self {
+        let mut count = 0;
+        let mut number = |o: &&Outline| {
+            let first = count;
+            count += o.tabs.len() + o.mouths.len();
+            first
+        };
+        let first = outlines.iter().map(&mut number).collect();
+        Self { first, tabs: outlines.iter().map(|o| o.tabs.len()).collect(), count }
+    }
+
+    pub(super) fn count(&self) -> usize {
+        self.count
+    }
+
+    pub(super) fn number(&self, slot: Slot) -> usize {
+        self.first[slot.piece] + slot.index + if slot.tab { 0 } else { self.tabs[slot.piece] }
+    }
+
+    /// All isthmuses of a piece.
+    pub(super) fn of(&self, piece: usize) -> impl Iterator<Item = Slot> {
+        let tabs = self.tabs[piece];
+        let end = self.first.get(piece + 1).copied().unwrap_or(self.count);
+        (0..end - self.first[piece]).map(move |k| {
+            let tab = k < tabs;
+            Slot { piece, tab, index: if tab { k } else { k - tabs } }
+        })
+    }
+}
