@@ -29,10 +29,14 @@
 //! # Ok::<(), isthmus::contour::ContourError>(())
 //! ```
 
+mod band;
+mod iso;
 mod restore;
 
 use crate::Point;
 use crate::mask::Cutout;
+use band::{Band, Blurred, Raw};
+use iso::{Contours, Raster, Start};
 use nalgebra::Vector2;
 use restore::{Filter, History, edge_blur, noise_power};
 
@@ -137,8 +141,6 @@ const NORMAL_MAD: f64 = 0.674_489_750_196_081_7;
 const TIGHTEST_CURVE: f64 = 0.04;
 /// Most optical blur that is undone, as a part of the radius of the tightest curves: more has destroyed them.
 const MAX_UNDONE: f64 = 0.6;
-/// A Gaussian kernel ends here, in standard deviations.
-const KERNEL_EXTENT: f64 = 3.0;
 /// Edges narrower than this (standard deviation of the edge's blur, in pixels) alias: linear interpolation errs.
 const MIN_EDGE_BLUR: f64 = 0.6;
 /// What the edges of an aliased picture are widened to, in pixels.
@@ -150,6 +152,8 @@ const MAX_NOISE: f64 = 1.0 / 16.0;
 const MAX_WOBBLE: f64 = 0.12;
 /// Most blur against noise, in pixels: more would join parts of the border.
 const MAX_BLUR: f64 = 3.0;
+/// From this much blur on, in pixels, a picture of half the resolution shows all there is.
+const HALVING_BLUR: f64 = 2.0;
 
 impl Border {
     /// Border from an outline given as the corners of a closed polygon (either sense), resampled at about 1 px.
@@ -330,15 +334,30 @@ fn shoelace(points: &[Point]) -> f64 {
     edges(points).map(|(p, q)| (p - origin).perp(&(q - origin))).sum::<f64>() / 2.0
 }
 
+/// Blur of a contour's picture: standard deviations in pixels.
+#[derive(Debug, Clone, Copy)]
+struct Blur {
+    /// That of the picture as it was taken.
+    optical: f64,
+    /// That which came after the noise, against it.
+    late: f64,
+}
+
+/// Memory for pictures made from a cutout.
+#[derive(Debug, Clone, Default)]
+struct PixelBuffers {
+    padded: Vec<u8>,
+    halved: Vec<u8>,
+}
+
 /// Traces borders, keeping its buffers from one to the next.
 #[derive(Debug, Clone, Default)]
 pub struct Tracer {
-    padded: Vec<u8>,
+    pixels: PixelBuffers,
     band: Band,
-    spans: Vec<Span>,
-    visited: Vec<bool>,
-    contour: Vec<Point>,
-    longest: Vec<Point>,
+    starts: Vec<Start>,
+    contours: Contours,
+    filtered: Vec<Point>,
     filter: Filter,
     deviations: Vec<f64>,
 }
@@ -366,90 +385,76 @@ impl Tracer {
         if cutout.pixels.is_empty() {
             return Err(ContourError::Nothing { level });
         }
-        let mut padded = std::mem::take(&mut self.padded);
-        let margin = pad(cutout, level, &mut padded);
-        let (width, height) = (width + 2 * margin, height + 2 * margin);
-        let pixels = if margin == 0 { &cutout.pixels } else { &padded };
-        let sense = if shape_level > ground_level { 1.0 } else { -1.0 };
-
-        let raw = Raw { pixels, width };
-        self.spans.clear();
-        raw.spans(level, sense, &mut self.spans);
-        let found = self.trace_longest(&Raster { picture: raw, width, height, level, contrast, sense });
-        let side = if sense > 0.0 { 1.0 } else { -1.0 };
-        let between = |p: Point| side * raw.between(p, height);
-        let mut optical = if found { edge_blur(&self.longest, f64::from(contrast), between) } else { 0.0 };
-        let late = needed_blur(f64::from(contrast), optical, f64::from(cutout.noise_level));
-        let found = if late > 0.0 && found {
-            let mut band = std::mem::take(&mut self.band);
-            band.mark(&self.longest, width, height);
-            band.blur(pixels, late, ground_level);
-            self.spans.clear();
-            band.spans(&mut self.spans);
-            let picture = Blurred { band: &band, raw };
-            let found = self.trace_longest(&Raster { picture, width, height, level, contrast, sense });
-            self.band = band;
-            if found {
-                optical = edge_blur(&self.longest, f64::from(contrast), between);
-            }
-            found
-        } else {
-            found
-        };
-        self.padded = padded;
-        if !found {
-            return Err(ContourError::Nothing { level });
-        }
-
-        let offset =
-            Vector2::new(f64::from(cutout.window.x) - margin as f64, f64::from(cutout.window.y) - margin as f64);
-        for p in &mut self.longest {
-            *p += offset;
-        }
+        let mut buffers = std::mem::take(&mut self.pixels);
+        let blur = self.trace_contour(cutout, level, &mut buffers);
+        self.pixels = buffers;
+        let Some(blur) = blur else { return Err(ContourError::Nothing { level }) };
         let mut border = Border { points: Vec::new(), spacing: SPACING };
-        border.resample(&self.longest)?;
-        let noise = self.restore(&mut border, optical, late)?;
+        border.resample(&self.contours.longest)?;
+        let noise = self.restore(&mut border, blur)?;
         Ok((border, noise))
     }
 
-    /// Traces all contours that go up through `self.spans` and leaves the longest outer one in `self.longest`.
-    fn trace_longest<P: Picture>(&mut self, raster: &Raster<P>) -> bool {
-        let (width, height) = (raster.width, raster.height);
-        self.visited.clear();
-        self.visited.resize(width * height, false);
-        self.longest.clear();
-        for span in &self.spans {
-            let y = span.y;
-            if y == 0 || y + 1 >= height {
-                continue;
-            }
-            let mut outside = span.start == 0 || raster.value(span.start - 1, y) <= 0.0;
-            for x in span.start..span.end {
-                let inside = raster.value(x, y) > 0.0;
-                if inside && outside && !self.visited[y * width + x] && x > 0 {
-                    raster.follow(x, y, &mut self.visited, &mut self.contour);
-                    if self.contour.len() > self.longest.len() && shoelace(&self.contour) > 0.0 {
-                        std::mem::swap(&mut self.contour, &mut self.longest);
-                    }
-                }
-                outside = !inside;
-            }
+    /// Leaves the longest contour in `self.contours.longest`, in the source frame; gives the blur it has, `None` without a contour.
+    fn trace_contour(&mut self, cutout: &Cutout, level: f32, buffers: &mut PixelBuffers) -> Option<Blur> {
+        let contrast = (cutout.shape_level - cutout.ground_level).abs();
+        let sense = if cutout.shape_level > cutout.ground_level { 1.0 } else { -1.0 };
+        let margin = pad(cutout, level, &mut buffers.padded);
+        let pixels = if margin == 0 { &cutout.pixels } else { &buffers.padded };
+        let [width, height] = [cutout.window.width, cutout.window.height].map(|side| side as usize + 2 * margin);
+        let full = Raw { pixels, width, height, step: 1.0 };
+        let noise = f64::from(cutout.noise_level) / f64::from(contrast);
+        // At half the resolution there is half the noise, and a quarter of the pixels.
+        let is_noisy = noise > MAX_NOISE;
+        let half = if is_noisy { Some(full.halved(&mut buffers.halved)) } else { None };
+
+        let first = half.unwrap_or(full);
+        first.starts(level, sense, &mut self.starts);
+        if !self.contours.trace(&Raster { picture: first, level, contrast, sense }, &self.starts) {
+            return None;
         }
-        !self.longest.is_empty()
+        let edge_blur_in = |raw: Raw<'_>, contour: &[Point]| {
+            let own = edge_blur(contour, f64::from(contrast), |p| f64::from(sense) * raw.between(p)) * raw.step;
+            (own * own - raw.variance()).max(0.0).sqrt()
+        };
+        let mut optical = edge_blur_in(first, &self.contours.longest);
+        let late = needed_blur(optical, noise);
+        if late > 0.0 {
+            let second = half.filter(|_| late >= HALVING_BLUR).unwrap_or(full);
+            let contour = self.contours.longest.iter().map(|p| second.own(first.in_full(*p)));
+            self.band.mark(contour, [second.width, second.height]);
+            let sigma = (late * late - second.variance()).sqrt() / second.step;
+            let is_shape = |value: f32| sense * (value - level) > 0.0;
+            self.band.blur(second.pixels, sigma, cutout.ground_level, is_shape, &mut self.starts);
+            let picture = Blurred { band: &self.band, raw: second };
+            if !self.contours.trace(&Raster { picture, level, contrast, sense }, &self.starts) {
+                return None;
+            }
+            for p in &mut self.contours.longest {
+                *p = second.in_full(*p);
+            }
+            optical = edge_blur_in(full, &self.contours.longest);
+        }
+        let offset =
+            Vector2::new(f64::from(cutout.window.x) - margin as f64, f64::from(cutout.window.y) - margin as f64);
+        for p in &mut self.contours.longest {
+            *p += offset;
+        }
+        Some(Blur { optical, late })
     }
 
     /// Undoes blur and noise of a border; gives the standard deviation of its points that is left.
-    fn restore(&mut self, border: &mut Border, optical_blur: f64, late_blur: f64) -> Result<f64, ContourError> {
-        let late_blur = late_blur / border.spacing;
+    fn restore(&mut self, border: &mut Border, Blur { optical, late }: Blur) -> Result<f64, ContourError> {
+        let late_blur = late / border.spacing;
         let step = NOISE_STEP.max((2.0 * late_blur).round() as usize);
         let noise = noise_power(self.fourth_difference(border, step).powi(2), late_blur, step);
         let size = border.area().sqrt() / border.spacing;
         let radius = TIGHTEST_CURVE * size;
-        let blur = (optical_blur / border.spacing).min(MAX_UNDONE * radius).hypot(late_blur);
+        let blur = (optical / border.spacing).min(MAX_UNDONE * radius).hypot(late_blur);
         let left = self.filter.design(History { blur, late_blur, radius }, noise);
-        self.filter.apply(&border.points, &mut self.contour);
+        self.filter.apply(&border.points, &mut self.filtered);
         border.spacing = SPACING;
-        border.resample(&self.contour)?;
+        border.resample(&self.filtered)?;
         Ok(left.sqrt() * border.spacing)
     }
 
@@ -495,9 +500,8 @@ fn pad(cutout: &Cutout, level: f32, padded: &mut Vec<u8>) -> usize {
     MARGIN
 }
 
-/// Blur in pixels that a picture needs before its contour can be trusted.
-fn needed_blur(contrast: f64, edge_blur: f64, noise: f64) -> f64 {
-    let noise = noise / contrast;
+/// Blur in pixels that a picture needs before its contour can be trusted; `noise` is a part of the contrast.
+fn needed_blur(edge_blur: f64, noise: f64) -> f64 {
     let edge = (2.0 * std::f64::consts::PI).sqrt();
     if noise > MAX_NOISE || noise * edge * edge_blur > MAX_WOBBLE {
         // A Gaussian of standard deviation s leaves 1 / (2 sqrt(pi) s) of the standard deviation of white noise, and an edge of
@@ -511,291 +515,5 @@ fn needed_blur(contrast: f64, edge_blur: f64, noise: f64) -> f64 {
         (EDGE_BLUR * EDGE_BLUR - edge_blur * edge_blur).sqrt()
     } else {
         0.0
-    }
-}
-
-/// Pixels of one row.
-#[derive(Debug, Clone, Copy)]
-struct Span {
-    y: usize,
-    start: usize,
-    /// One past the last pixel.
-    end: usize,
-}
-
-/// Grey levels by place.
-trait Picture {
-    fn at(&self, x: usize, y: usize) -> f32;
-}
-
-/// The pixels as they are.
-#[derive(Clone, Copy)]
-struct Raw<'a> {
-    pixels: &'a [u8],
-    width: usize,
-}
-
-impl Picture for Raw<'_> {
-    fn at(&self, x: usize, y: usize) -> f32 {
-        f32::from(self.pixels[y * self.width + x])
-    }
-}
-
-impl Raw<'_> {
-    /// Grey level between the pixels of a picture of `height` rows, which is continued by its outermost pixels.
-    fn between(&self, p: Point, height: usize) -> f64 {
-        let (x, y) = (p.x.clamp(0.0, (self.width - 1) as f64), p.y.clamp(0.0, (height - 1) as f64));
-        let (i, j) = (x as usize, y as usize);
-        let (u, v) = (x - i as f64, y - j as f64);
-        let (i1, j1) = ((i + 1).min(self.width - 1), (j + 1).min(height - 1));
-        let at = |x: usize, y: usize| f64::from(self.pixels[y * self.width + x]);
-        let (upper, lower) = (at(i, j) + (at(i1, j) - at(i, j)) * u, at(i, j1) + (at(i1, j1) - at(i, j1)) * u);
-        upper + (lower - upper) * v
-    }
-
-    /// The stretches of rows in which ground is followed by shape, and a few more.
-    fn spans(&self, level: f32, sense: f32, spans: &mut Vec<Span>) {
-        /// Pixels that are looked at together: most of a row is uniform.
-        const CHUNK: usize = 16;
-        // Beyond the levels of a byte, one step further is as good as any.
-        let bright = sense > 0.0;
-        let bound = if bright { level.floor() } else { level.ceil() }.clamp(-1.0, 256.0) as i16;
-        for (y, row) in self.pixels.chunks_exact(self.width).enumerate() {
-            let mut before = false;
-            for (k, chunk) in row.chunks(CHUNK).enumerate() {
-                let inside: u8 = if bright {
-                    chunk.iter().map(|&p| u8::from(i16::from(p) > bound)).sum()
-                } else {
-                    chunk.iter().map(|&p| u8::from(i16::from(p) < bound)).sum()
-                };
-                let all = usize::from(inside) == chunk.len();
-                if inside > 0 && !(all && before) {
-                    spans.push(Span { y, start: k * CHUNK, end: k * CHUNK + chunk.len() });
-                }
-                before =
-                    all || chunk.last().is_some_and(|&p| (i16::from(p) > bound) == bright && i16::from(p) != bound);
-            }
-        }
-    }
-}
-
-/// The cells of a picture round a contour, blurred.
-#[derive(Debug, Clone, Default)]
-struct Band {
-    width: usize,
-    height: usize,
-    /// Cells in a row.
-    columns: usize,
-    /// For each cell where its levels begin, or [`OUTSIDE_BAND`].
-    cells: Vec<usize>,
-    levels: Vec<f32>,
-    across: Vec<f32>,
-    blurred: Vec<f32>,
-}
-
-/// Side of a cell in pixels: with its neighbours it covers what the greatest blur moves a contour by.
-const CELL: usize = 8;
-const OUTSIDE_BAND: usize = usize::MAX;
-
-impl Band {
-    /// Takes the cells that a contour goes through, and their neighbours.
-    fn mark(&mut self, contour: &[Point], width: usize, height: usize) {
-        (self.width, self.height) = (width, height);
-        self.columns = width.div_ceil(CELL);
-        let rows = height.div_ceil(CELL);
-        self.cells.clear();
-        self.cells.resize(self.columns * rows, OUTSIDE_BAND);
-        let mut last = OUTSIDE_BAND;
-        for p in contour {
-            let (column, row) = (p.x as usize / CELL, p.y as usize / CELL);
-            if std::mem::replace(&mut last, row * self.columns + column) == last {
-                continue;
-            }
-            let columns = column.saturating_sub(1)..self.columns.min(column + 2);
-            for row in row.saturating_sub(1)..rows.min(row + 2) {
-                self.cells[row * self.columns + columns.start..row * self.columns + columns.end].fill(0);
-            }
-        }
-        let mut count = 0;
-        for cell in self.cells.iter_mut().filter(|c| **c != OUTSIDE_BAND) {
-            *cell = count * CELL * CELL;
-            count += 1;
-        }
-        self.levels.clear();
-        self.levels.resize(count * CELL * CELL, 0.0);
-    }
-
-    /// Neighbouring cells of a row: the row, and the columns from the first to one past the last.
-    fn stretches(&self) -> impl Iterator<Item = (usize, std::ops::Range<usize>)> {
-        self.cells.chunks_exact(self.columns.max(1)).enumerate().flat_map(|(row, cells)| {
-            let mut from = 0;
-            std::iter::from_fn(move || {
-                let start = from + cells[from..].iter().position(|c| *c != OUTSIDE_BAND)?;
-                let count = cells[start..].iter().position(|c| *c == OUTSIDE_BAND);
-                from = count.map_or(cells.len(), |count| start + count);
-                Some((row, start..from))
-            })
-        })
-    }
-
-    fn spans(&self, spans: &mut Vec<Span>) {
-        for (row, columns) in self.stretches() {
-            let (start, end) = (columns.start * CELL, self.width.min(columns.end * CELL));
-            spans.extend((row * CELL..self.height.min((row + 1) * CELL)).map(|y| Span { y, start, end }));
-        }
-    }
-
-    /// Separable Gaussian blur of the cells; the picture is continued by its outermost pixels, which then become ground, so that
-    /// contours close within.
-    fn blur(&mut self, pixels: &[u8], sigma: f64, ground: f32) {
-        let reach = (KERNEL_EXTENT * sigma).ceil() as usize;
-        let mut kernel: Vec<f32> = (0..=2 * reach)
-            .map(|i| (-(i as f64 - reach as f64).powi(2) / (2.0 * sigma * sigma)).exp() as f32)
-            .collect();
-        let total: f32 = kernel.iter().sum();
-        kernel.iter_mut().for_each(|k| *k /= total);
-        let (width, height) = (self.width, self.height);
-        let (mut across, mut blurred) = (std::mem::take(&mut self.across), std::mem::take(&mut self.blurred));
-        let mut levels = std::mem::take(&mut self.levels);
-        for (row, columns) in self.stretches() {
-            let (start, end) = (columns.start * CELL, width.min(columns.end * CELL));
-            // Pixels that the kernel needs, and how many of them lie beyond the picture.
-            let (from, to) = (start.saturating_sub(reach), width.min(end + reach));
-            let before = (reach + from) - start;
-            for y in row * CELL..height.min((row + 1) * CELL) {
-                across.clear();
-                across.resize(end - start + 2 * reach, 0.0);
-                let within = before..before + to - from;
-                for (i, k) in kernel.iter().enumerate() {
-                    let source = (y + i).saturating_sub(reach).min(height - 1) * width;
-                    for (sum, p) in across[within.clone()].iter_mut().zip(&pixels[source + from..source + to]) {
-                        *sum += k * f32::from(*p);
-                    }
-                }
-                let (first, last) = (across[within.start], across[within.end - 1]);
-                across[..within.start].fill(first);
-                across[within.end..].fill(last);
-                blurred.clear();
-                blurred.resize(end - start, 0.0);
-                for (i, k) in kernel.iter().enumerate() {
-                    for (sum, p) in blurred.iter_mut().zip(&across[i..]) {
-                        *sum += k * p;
-                    }
-                }
-                if start == 0 {
-                    blurred[0] = ground;
-                }
-                if end == width {
-                    blurred[end - start - 1] = ground;
-                }
-                if y == 0 || y == height - 1 {
-                    blurred.fill(ground);
-                }
-                for (column, part) in columns.clone().zip(blurred.chunks(CELL)) {
-                    let at = self.cells[row * self.columns + column] + y % CELL * CELL;
-                    levels[at..at + part.len()].copy_from_slice(part);
-                }
-            }
-        }
-        (self.across, self.blurred, self.levels) = (across, blurred, levels);
-    }
-}
-
-/// A picture that is blurred near a contour.
-#[derive(Clone, Copy)]
-struct Blurred<'a> {
-    band: &'a Band,
-    raw: Raw<'a>,
-}
-
-impl Picture for Blurred<'_> {
-    fn at(&self, x: usize, y: usize) -> f32 {
-        match self.band.cells[y / CELL * self.band.columns + x / CELL] {
-            OUTSIDE_BAND => self.raw.at(x, y),
-            cell => self.band.levels[cell + y % CELL * CELL + x % CELL],
-        }
-    }
-}
-
-/// A picture whose outermost pixels are ground.
-struct Raster<P> {
-    picture: P,
-    width: usize,
-    height: usize,
-    level: f32,
-    /// Difference of the levels of shape and ground.
-    contrast: f32,
-    /// 1 for a shape brighter than the ground, -1 for a darker one.
-    sense: f32,
-}
-
-/// Sides of a marching squares cell.
-#[derive(Clone, Copy, PartialEq)]
-enum Side {
-    Top,
-    Right,
-    Bottom,
-    Left,
-}
-
-impl<P: Picture> Raster<P> {
-    /// Difference from the level, positive in the shape.
-    fn value(&self, x: usize, y: usize) -> f32 {
-        self.sense * (self.picture.at(x, y) - self.level)
-    }
-
-    /// How deep within the shape a pixel lies, in units of the edge's blur, from its difference from the level: the inverse of the
-    /// error function, by its series. Between pixels it is linear across an edge, as the grey level is not.
-    fn depth(&self, value: f32) -> f32 {
-        let part = (value / self.contrast).clamp(-0.5, 0.5);
-        let square = part * part;
-        part * (1.0 + square * (std::f32::consts::FRAC_PI_3 + square * 2.303))
-    }
-
-    /// Follows the contour that runs up between the pixels `(x - 1, y)` (ground) and `(x, y)` (shape), the shape on its
-    /// right-hand side. Marks the shape pixels to the right of its upward steps.
-    fn follow(&self, x: usize, y: usize, visited: &mut [bool], contour: &mut Vec<Point>) {
-        contour.clear();
-        let value = |x: usize, y: usize| self.value(x, y);
-        let (start_x, start_y) = (x - 1, y - 1);
-        let (mut x, mut y, mut entry) = (start_x, start_y, Side::Bottom);
-        loop {
-            let (a, b, c, d) = (value(x, y), value(x + 1, y), value(x + 1, y + 1), value(x, y + 1));
-            let corners = u8::from(a > 0.0) | u8::from(b > 0.0) << 1 | u8::from(c > 0.0) << 2 | u8::from(d > 0.0) << 3;
-            let joined = || a + b + c + d > 0.0;
-            let exit = match corners {
-                0b0010 | 0b0110 | 0b1110 => Side::Top,
-                0b0100 | 0b1100 | 0b1101 => Side::Right,
-                0b1000 | 0b1001 | 0b1011 => Side::Bottom,
-                0b0001 | 0b0011 | 0b0111 => Side::Left,
-                0b0101 if (entry == Side::Top) == joined() => Side::Right,
-                0b0101 => Side::Left,
-                _ if (entry == Side::Left) == joined() => Side::Top,
-                _ => Side::Bottom,
-            };
-            let (fx, fy) = (x as f64, y as f64);
-            let between = |p: f32, q: f32| {
-                let (p, q) = (self.depth(p), self.depth(q));
-                f64::from(p / (p - q))
-            };
-            contour.push(match exit {
-                Side::Top => Point::new(fx + between(a, b), fy),
-                Side::Right => Point::new(fx + 1.0, fy + between(b, c)),
-                Side::Bottom => Point::new(fx + between(d, c), fy + 1.0),
-                Side::Left => Point::new(fx, fy + between(a, d)),
-            });
-            (x, y, entry) = match exit {
-                Side::Top => {
-                    visited[y * self.width + x + 1] = true;
-                    (x, y - 1, Side::Bottom)
-                }
-                Side::Right => (x + 1, y, Side::Left),
-                Side::Bottom => (x, y + 1, Side::Top),
-                Side::Left => (x - 1, y, Side::Right),
-            };
-            if (x, y) == (start_x, start_y) && entry == Side::Bottom {
-                return;
-            }
-        }
     }
 }

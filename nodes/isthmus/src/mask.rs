@@ -37,6 +37,7 @@ mod ground;
 mod runs;
 
 use ground::{Blocks, Ground, median, quantile};
+pub(crate) use runs::changes;
 use runs::{Component, Components};
 
 use crate::Point;
@@ -346,7 +347,7 @@ impl Segmenter {
         self.coarse.clear();
         for (row, residual) in ground.residual.chunks_exact(columns).enumerate() {
             self.coarse.begin_row(row);
-            self.coarse.add_row(0, residual, |r| r > ground.threshold);
+            self.coarse.add_row(residual, |r| r > ground.threshold);
         }
         self.coarse.close();
         self.claim_blocks();
@@ -390,11 +391,9 @@ impl Segmenter {
         for run in &self.coarse.runs {
             let label = run.label as u32;
             for row in run.row.saturating_sub(1)..rows.min(run.row + 2) {
-                for column in run.start.saturating_sub(1)..columns.min(run.end + 1) {
-                    let owner = &mut self.owner[row * columns + column];
-                    if *owner == NOBODY {
-                        *owner = label;
-                    }
+                let (start, end) = (run.start.saturating_sub(1), columns.min(run.end + 1));
+                for owner in &mut self.owner[row * columns + start..row * columns + end] {
+                    *owner = if *owner == NOBODY { label } else { *owner };
                 }
             }
         }
@@ -447,8 +446,12 @@ impl Segmenter {
             }
             // What belongs to other components is made ground.
             let within = from / block..to.div_ceil(block);
+            let is_foreign = |owner: u32| owner != label && owner != NOBODY;
+            if owners[within.clone()].iter().fold(0, |count, owner| count + u32::from(is_foreign(*owner))) == 0 {
+                continue;
+            }
             for (column, owner) in within.clone().zip(&owners[within]) {
-                if *owner != label && *owner != NOBODY {
+                if is_foreign(*owner) {
                     let (start, end) = ((column * block).max(from), ((column + 1) * block).min(to));
                     out[start - from..end - from].fill(ground_pixel);
                 }
@@ -480,8 +483,9 @@ impl Segmenter {
         };
         // A block all of whose neighbours belong to the component, those beyond the frame included.
         let inside = |column: usize, row: usize| -> bool {
-            (row.saturating_sub(1)..self.blocks.rows.min(row + 2))
-                .all(|r| (column.saturating_sub(1)..columns.min(column + 2)).all(|c| self.is_of(ground, k, c, r)))
+            self.is_of(ground, k, column, row)
+                && (row.saturating_sub(1)..self.blocks.rows.min(row + 2))
+                    .all(|r| (column.saturating_sub(1)..columns.min(column + 2)).all(|c| self.is_of(ground, k, c, r)))
         };
         let mut list = Vec::new();
         let mut signed = Vec::new();
@@ -669,10 +673,10 @@ impl Crop {
             components.begin_row(y);
             if self.shape_level > self.ground_level {
                 let least = level.floor() as u8;
-                components.add_row(0, row, |p| p > least);
+                components.add_row(row, |p| p > least);
             } else {
                 let most = level.ceil() as u8;
-                components.add_row(0, row, |p| p < most);
+                components.add_row(row, |p| p < most);
             }
         }
         components.close();

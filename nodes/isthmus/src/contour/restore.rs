@@ -26,6 +26,9 @@ const SIGNAL: f64 = 0.5;
 /// Standard deviation of a contour's points in a picture without noise, in pixels: interpolation, quantisation and pixel grid.
 const CONTOUR_ERROR: f64 = 0.02;
 
+/// Points that are filtered together.
+const BLOCK: usize = 8;
+
 /// What happened to a border between the shape and its contour. Lengths in points of the border.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct History {
@@ -43,7 +46,7 @@ pub(super) struct Filter {
     /// Weights of a point and of those to either side of it.
     weights: Vec<f64>,
     sums: Vec<f64>,
-    unrolled: Vec<Point>,
+    unrolled: Vec<f64>,
 }
 
 impl Filter {
@@ -88,18 +91,34 @@ impl Filter {
         let reach = (self.weights.len() - 1).min(n / 2);
         let weights = &self.weights[..=reach];
         let total = 2.0 * weights.iter().sum::<f64>() - weights[0];
-        self.unrolled.clear();
-        self.unrolled.extend_from_slice(&points[n - reach..]);
-        self.unrolled.extend_from_slice(points);
-        self.unrolled.extend_from_slice(&points[..reach]);
         filtered.clear();
-        filtered.extend(self.unrolled.windows(2 * reach + 1).map(|window| {
-            let mut sum = window[reach].coords * weights[0];
-            for (j, weight) in weights.iter().enumerate().skip(1) {
-                sum += (window[reach - j].coords + window[reach + j].coords) * *weight;
+        filtered.resize(n, Point::origin());
+        for axis in 0..2 {
+            let unrolled = &mut self.unrolled;
+            unrolled.clear();
+            unrolled.extend(points[n - reach..].iter().chain(points).chain(&points[..reach]).map(|p| p[axis]));
+            // The last block may be a part of one.
+            unrolled.resize(n.next_multiple_of(BLOCK) + 2 * reach, 0.0);
+            for (block, out) in filtered.chunks_mut(BLOCK).enumerate() {
+                // Weight by weight, some points at a time: their sums stay in registers.
+                let at = |shift: usize| {
+                    let mut values = [0.0; BLOCK];
+                    values.copy_from_slice(&unrolled[block * BLOCK + shift..][..BLOCK]);
+                    values
+                };
+                let mut sums = at(reach);
+                sums.iter_mut().for_each(|sum| *sum *= weights[0]);
+                for (j, weight) in weights.iter().enumerate().skip(1) {
+                    let (before, after) = (at(reach - j), at(reach + j));
+                    for i in 0..BLOCK {
+                        sums[i] += (before[i] + after[i]) * weight;
+                    }
+                }
+                for (out, sum) in out.iter_mut().zip(sums) {
+                    out[axis] = sum / total;
+                }
             }
-            Point::from(sum / total)
-        }));
+        }
     }
 }
 

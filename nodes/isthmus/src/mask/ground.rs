@@ -58,40 +58,48 @@ impl Blocks {
         }
         for block_row in 0..self.rows {
             let rows = block_row * self.size..height.min((block_row + 1) * self.size);
+            // The usual blocks are summed eight pixels at a time; what is left of the row goes the common way.
+            let done = match (&mut self.planes[..], self.size, rows.len()) {
+                ([plane], 4, 4) => sum_blocks([0, 1, 2, 3].map(|k| frame.row(rows.start + k)), plane),
+                _ => 0,
+            };
+            if done == width {
+                continue;
+            }
             let count = rows.len();
             self.sums.clear();
-            self.sums.resize(width * channels, 0);
+            self.sums.resize((width - done) * channels, 0);
             for y in rows {
-                for (sum, p) in self.sums.iter_mut().zip(frame.row(y)) {
+                for (sum, p) in self.sums.iter_mut().zip(&frame.row(y)[done * channels..]) {
                     *sum += u16::from(*p);
                 }
             }
             for (c, plane) in self.planes.iter_mut().enumerate() {
-                match (channels, self.size) {
-                    // The usual sizes are spelt out: the compiler vectorises them.
-                    (1, 4) => mean_of::<4>(&self.sums, count, plane),
-                    (1, 2) => mean_of::<2>(&self.sums, count, plane),
-                    _ => plane.extend(self.sums.chunks(self.size * channels).map(|block| {
-                        let sum: u32 = block.iter().skip(c).step_by(channels).map(|s| u32::from(*s)).sum();
-                        sum as f32 / (block.len() / channels * count) as f32
-                    })),
-                }
+                plane.extend(self.sums.chunks(self.size * channels).map(|block| {
+                    let sum: u32 = block.iter().skip(c).step_by(channels).map(|s| u32::from(*s)).sum();
+                    sum as f32 / (block.len() / channels * count) as f32
+                }));
             }
         }
     }
 }
 
-fn mean_of<const N: usize>(sums: &[u16], rows: usize, plane: &mut Vec<f32>) {
-    let (blocks, rest) = sums.as_chunks::<N>();
-    let scale = 1.0 / (N * rows) as f32;
-    plane.extend(blocks.iter().map(|b| {
-        // Four sums side by side in one number, times four ones side by side: the highest part is their sum.
-        let packed = b.iter().rev().fold(0, |packed, s| packed << 16 | u64::from(*s));
-        (packed.wrapping_mul(0x0001_0001_0001_0001) >> 48) as f32 * scale
-    }));
-    if !rest.is_empty() {
-        plane.push(f32::from(rest.iter().sum::<u16>()) / (rest.len() * rows) as f32);
+/// Appends the means of the blocks of 4 x 4 pixels of four rows, of two blocks at a time; gives the number of columns done.
+fn sum_blocks(rows: [&[u8]; 4], means: &mut Vec<f32>) -> usize {
+    /// Every other byte, and every other pair of bytes, of a word.
+    const BYTES: u64 = 0x00ff_00ff_00ff_00ff;
+    const PAIRS: u64 = 0x0000_ffff_0000_ffff;
+    let [a, b, c, d] = rows.map(|row| row.as_chunks::<8>().0);
+    let from = means.len();
+    means.resize(from + 2 * a.len(), 0.0);
+    let words = a.iter().zip(b).zip(c).zip(d).map(|(((a, b), c), d)| [a, b, c, d].map(|p| u64::from_le_bytes(*p)));
+    for (means, words) in means[from..].as_chunks_mut::<2>().0.iter_mut().zip(words) {
+        // Sums side by side in one word: of the pixels of a pair, then of two pairs. No sum outgrows its sixteen bits.
+        let pairs = words.iter().fold(0, |sum, w| sum + (w & BYTES) + (w >> 8 & BYTES));
+        let blocks = (pairs & PAIRS) + (pairs >> 16 & PAIRS);
+        *means = [blocks as u32 as i32, (blocks >> 32) as i32].map(|sum| sum as f32 / 16.0);
     }
+    a.len() * 8
 }
 
 /// Side of a block in pixels: small pictures have small shapes.
@@ -130,7 +138,7 @@ impl Surface {
         let [k0, k1, k2] = [c[0] + v * (c[2] + v * c[5]), c[1] + v * c[4], c[3]].map(|k| k as f32);
         let (first, step) = ((column * self.scale[0] - 1.0) as f32, (step * self.scale[0]) as f32);
         for (i, level) in levels.iter_mut().enumerate() {
-            let u = first + i as u32 as f32 * step;
+            let u = first + i as i32 as f32 * step;
             *level = k0 + u * (k1 + u * k2);
         }
     }
@@ -219,7 +227,10 @@ pub(super) fn candidates(blocks: &Blocks) -> Vec<Candidate> {
     let best = channels
         .iter()
         .map(|channel| {
-            let values: Vec<f32> = blocks.samples.iter().map(|s| channel.at(planes, s.block)).collect();
+            let values: Vec<f32> = match channel {
+                Channel::Plane(c) => blocks.samples.iter().map(|s| planes[*c][s.block]).collect(),
+                _ => blocks.samples.iter().map(|s| channel.at(planes, s.block)).collect(),
+            };
             let split = otsu(&values);
             (channel, values, split)
         })
@@ -315,11 +326,16 @@ fn fit_surface(blocks: &Blocks, plane: &[f32], is_ground: &[bool]) -> Surface {
     // Between the rounds, samples far from the fit (specks, shadows) are left out: those beyond three deviations.
     let mut limit = f64::INFINITY;
     for _ in 0..2 {
+        // The lower half of the normal equations; the factorisation looks at no more.
         let mut normal = Matrix6::zeros();
         let mut right = Vector6::zeros();
         for (basis, value) in &samples {
             if (value - surface.coefficients.dot(basis)).abs() <= limit {
-                normal += basis * basis.transpose();
+                for j in 0..6 {
+                    for i in j..6 {
+                        normal[(i, j)] += basis[i] * basis[j];
+                    }
+                }
                 right += basis * *value;
             }
         }

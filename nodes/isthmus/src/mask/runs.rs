@@ -24,6 +24,35 @@ pub(super) struct Component {
     pub(super) bottom: usize,
 }
 
+/// Tells where in a row of pixels `set` begins to hold (`true`) and where it ceases to (`false`), from left to right; before the row
+/// it does not hold.
+pub(crate) fn changes<P: Copy>(row: &[P], set: impl Fn(P) -> bool, mut change: impl FnMut(usize, bool)) {
+    /// Pixels that are looked at together, as bits of a number; most chunks are uniform.
+    const CHUNK: usize = 32;
+    let mut holds = false;
+    let (chunks, rest) = row.as_chunks::<CHUNK>();
+    for (k, chunk) in chunks.iter().enumerate() {
+        let count = chunk.iter().fold(0u8, |n, &p| n + u8::from(set(p)));
+        if usize::from(count) == if holds { CHUNK } else { 0 } {
+            continue;
+        }
+        let bits = chunk.iter().rev().fold(0u32, |bits, &p| bits << 1 | u32::from(set(p)));
+        // A bit for each pixel that differs from the one before.
+        let mut differ = bits ^ (bits << 1 | u32::from(holds));
+        while differ != 0 {
+            holds = !holds;
+            change(k * CHUNK + differ.trailing_zeros() as usize, holds);
+            differ &= differ - 1;
+        }
+    }
+    for (k, &p) in rest.iter().enumerate() {
+        if set(p) != holds {
+            holds = !holds;
+            change(chunks.len() * CHUNK + k, holds);
+        }
+    }
+}
+
 /// Runs and components, filled row by row.
 #[derive(Debug, Clone, Default)]
 pub(super) struct Components {
@@ -53,33 +82,15 @@ impl Components {
     }
 
     /// Adds the runs of the current row where `set` holds.
-    pub(super) fn add_row<P: Copy>(&mut self, offset: usize, row: &[P], set: impl Fn(P) -> bool) {
-        /// Pixels that are looked at together: most of a row is uniform.
-        const CHUNK: usize = 16;
+    pub(super) fn add_row<P: Copy>(&mut self, row: &[P], set: impl Fn(P) -> bool) {
         let mut start = None;
-        let mut x = 0;
-        while x < row.len() {
-            if let Some(chunk) = row.get(x..x + CHUNK) {
-                let count = chunk.iter().fold(0u8, |n, &p| n + u8::from(set(p)));
-                if count == if start.is_some() { CHUNK as u8 } else { 0 } {
-                    x += CHUNK;
-                    continue;
-                }
-            }
-            for &p in &row[x..row.len().min(x + CHUNK)] {
-                match (start, set(p)) {
-                    (None, true) => start = Some(x),
-                    (Some(from), false) => {
-                        self.push(offset + from, offset + x);
-                        start = None;
-                    }
-                    _ => {}
-                }
-                x += 1;
-            }
-        }
+        changes(row, set, |x, begins| match start.take() {
+            None if begins => start = Some(x),
+            Some(from) => self.push(from, x),
+            None => {}
+        });
         if let Some(from) = start {
-            self.push(offset + from, offset + row.len());
+            self.push(from, row.len());
         }
     }
 

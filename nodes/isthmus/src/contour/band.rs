@@ -1,0 +1,294 @@
+//! Grey levels near a contour: as they are, at half the resolution, or blurred against noise.
+//!
+//! What is far from the contour is never looked at: the picture is blurred in cells that the contour goes through, and in their
+//! neighbours, in fixed point, eight pixels at a time.
+
+use super::iso::{Picture, Start};
+use crate::Point;
+use crate::mask::changes;
+
+/// The pixels as they are.
+#[derive(Clone, Copy)]
+pub(super) struct Raw<'a> {
+    pub(super) pixels: &'a [u8],
+    pub(super) width: usize,
+    pub(super) height: usize,
+    /// Distance of its pixels in pixels of the full picture.
+    pub(super) step: f64,
+}
+
+impl Picture for Raw<'_> {
+    fn size(&self) -> [usize; 2] {
+        [self.width, self.height]
+    }
+
+    fn at(&self, x: usize, y: usize) -> f32 {
+        f32::from(self.pixels[y * self.width + x])
+    }
+}
+
+impl Raw<'_> {
+    /// Grey level between the pixels of a picture, which is continued by its outermost pixels.
+    pub(super) fn between(&self, p: Point) -> f64 {
+        let (x, y) = (p.x.clamp(0.0, (self.width - 1) as f64), p.y.clamp(0.0, (self.height - 1) as f64));
+        let (i, j) = (x as usize, y as usize);
+        let (u, v) = (x - i as f64, y - j as f64);
+        let (i1, j1) = ((i + 1).min(self.width - 1), (j + 1).min(self.height - 1));
+        let at = |x: usize, y: usize| f64::from(self.pixels[y * self.width + x]);
+        let (upper, lower) = (at(i, j) + (at(i1, j) - at(i, j)) * u, at(i, j1) + (at(i1, j1) - at(i, j1)) * u);
+        upper + (lower - upper) * v
+    }
+
+    /// Where rows go over from ground to shape.
+    pub(super) fn starts(&self, level: f32, sense: f32, starts: &mut Vec<Start>) {
+        starts.clear();
+        // Beyond the levels of a byte, one step further is as good as any.
+        let bound = if sense > 0.0 { level.floor() } else { level.ceil() }.clamp(-1.0, 256.0) as i16;
+        for (y, row) in self.pixels.chunks_exact(self.width).enumerate() {
+            let change = |x, begins| {
+                if begins {
+                    starts.push(Start { x, y });
+                }
+            };
+            if sense > 0.0 {
+                changes(row, |p| i16::from(p) > bound, change);
+            } else {
+                changes(row, |p| i16::from(p) < bound, change);
+            }
+        }
+    }
+
+    /// A place of the full picture in this one.
+    pub(super) fn own(&self, p: Point) -> Point {
+        Point::from(p.coords.map(|v| (v + 0.5) / self.step - 0.5))
+    }
+
+    /// A place of this picture in the full one.
+    pub(super) fn in_full(&self, p: Point) -> Point {
+        Point::from(p.coords.map(|v| (v + 0.5) * self.step - 0.5))
+    }
+
+    /// Variance of the blur that pixels of this size add to that of the full picture, in its square pixels.
+    pub(super) fn variance(&self) -> f64 {
+        (self.step * self.step - 1.0) / 12.0
+    }
+
+    /// The picture at half the resolution: means of 2 x 2 pixels; of an odd side the last pixel counts twice.
+    pub(super) fn halved<'a>(&self, halved: &'a mut Vec<u8>) -> Raw<'a> {
+        let (width, height) = (self.width.div_ceil(2), self.height.div_ceil(2));
+        halved.clear();
+        halved.resize(width * height, 0);
+        for (y, out) in halved.chunks_exact_mut(width).enumerate() {
+            let row = |y: usize| &self.pixels[y.min(self.height - 1) * self.width..][..self.width];
+            let (upper, upper_rest) = row(2 * y).as_chunks::<8>();
+            let (lower, lower_rest) = row(2 * y + 1).as_chunks::<8>();
+            let (out, out_rest) = out.split_at_mut(4 * upper.len());
+            for (out, (a, b)) in out.as_chunks_mut::<4>().0.iter_mut().zip(upper.iter().zip(lower)) {
+                // Four sums side by side in one word, and a half for rounding.
+                let words = [a, b].map(|p| u64::from_le_bytes(*p));
+                let sums = words.iter().fold(TWOS, |sum, w| sum + (w & EVEN_BYTES) + (w >> 8 & EVEN_BYTES)) >> 2;
+                *out = [sums as u8, (sums >> 16) as u8, (sums >> 32) as u8, (sums >> 48) as u8];
+            }
+            for (out, (a, b)) in out_rest.iter_mut().zip(upper_rest.chunks(2).zip(lower_rest.chunks(2))) {
+                let sum: usize = [a, b].iter().flat_map(|p| [p[0], p[p.len() - 1]]).map(usize::from).sum();
+                *out = ((sum + 2) / 4) as u8;
+            }
+        }
+        Raw { pixels: halved, width, height, step: 2.0 * self.step }
+    }
+}
+
+/// The cells of a picture round a contour, blurred.
+#[derive(Debug, Clone, Default)]
+pub(super) struct Band {
+    width: usize,
+    height: usize,
+    /// Cells in a row.
+    columns: usize,
+    /// For each cell where its levels begin, or [`OUTSIDE_BAND`].
+    cells: Vec<usize>,
+    /// Levels of the cells' pixels, in parts of a grey level.
+    levels: Vec<u16>,
+    across: Vec<u16>,
+    blurred: Vec<[u16; CELL]>,
+}
+
+/// Side of a cell in pixels: with its neighbours it covers what the greatest blur moves a contour by; and eight numbers of two bytes are
+/// a register of the processor.
+const CELL: usize = 8;
+const OUTSIDE_BAND: usize = usize::MAX;
+/// Parts of a grey level, as a power of two: the sum of two levels just fits in sixteen bits.
+const LEVEL_BITS: u32 = 7;
+const PARTS: f32 = (1 << LEVEL_BITS) as f32;
+/// A Gaussian kernel ends here, in standard deviations.
+const KERNEL_EXTENT: f64 = 3.0;
+
+/// Every other byte of a word, and a two in each of these places.
+const EVEN_BYTES: u64 = 0x00ff_00ff_00ff_00ff;
+const TWOS: u64 = 0x0002_0002_0002_0002;
+
+impl Band {
+    /// Takes the cells that a contour goes through, and their neighbours.
+    pub(super) fn mark(&mut self, contour: impl Iterator<Item = Point>, [width, height]: [usize; 2]) {
+        (self.width, self.height) = (width, height);
+        self.columns = width.div_ceil(CELL);
+        let rows = height.div_ceil(CELL);
+        self.cells.clear();
+        self.cells.resize(self.columns * rows, OUTSIDE_BAND);
+        let mut last = OUTSIDE_BAND;
+        for p in contour {
+            let (column, row) = ((p.x as usize / CELL).min(self.columns - 1), (p.y as usize / CELL).min(rows - 1));
+            if std::mem::replace(&mut last, row * self.columns + column) == last {
+                continue;
+            }
+            let columns = column.saturating_sub(1)..self.columns.min(column + 2);
+            for row in row.saturating_sub(1)..rows.min(row + 2) {
+                self.cells[row * self.columns + columns.start..row * self.columns + columns.end].fill(0);
+            }
+        }
+        let mut count = 0;
+        for cell in self.cells.iter_mut().filter(|c| **c != OUTSIDE_BAND) {
+            *cell = count * CELL * CELL;
+            count += 1;
+        }
+        self.levels.clear();
+        self.levels.resize(count * CELL * CELL, 0);
+    }
+
+    /// Neighbouring cells of a row: the row, and the columns from the first to one past the last.
+    fn stretches(&self) -> impl Iterator<Item = (usize, std::ops::Range<usize>)> {
+        self.cells.chunks_exact(self.columns.max(1)).enumerate().flat_map(|(row, cells)| {
+            let mut from = 0;
+            std::iter::from_fn(move || {
+                let start = from + cells[from..].iter().position(|c| *c != OUTSIDE_BAND)?;
+                let count = cells[start..].iter().position(|c| *c == OUTSIDE_BAND);
+                from = count.map_or(cells.len(), |count| start + count);
+                Some((row, start..from))
+            })
+        })
+    }
+
+    /// Separable Gaussian blur of the cells; the picture is continued by its outermost pixels, which then become `ground`, so that
+    /// contours close within. `starts` becomes where rows of cells go over to what `is_shape`.
+    pub(super) fn blur(
+        &mut self,
+        pixels: &[u8],
+        sigma: f64,
+        ground: f32,
+        is_shape: impl Fn(f32) -> bool,
+        starts: &mut Vec<Start>,
+    ) {
+        let weights = kernel(sigma);
+        let reach = weights.len() - 1;
+        let (width, height) = (self.width, self.height);
+        let ground = (ground.clamp(0.0, 255.0) * PARTS) as u16;
+        let (mut across, mut blurred) = (std::mem::take(&mut self.across), std::mem::take(&mut self.blurred));
+        let mut levels = std::mem::take(&mut self.levels);
+        starts.clear();
+        for (row, columns) in self.stretches() {
+            let (start, count) = (columns.start * CELL, columns.len() * CELL);
+            // Pixels that the kernel needs, and how many of them lie beyond the picture.
+            let (from, to) = (start.saturating_sub(reach), width.min(start + count + reach));
+            let before = reach + from - start;
+            for y in row * CELL..height.min((row + 1) * CELL) {
+                let row_at = |y: usize| &pixels[y.min(height - 1) * width..][from..to];
+                across.clear();
+                across.resize(count + 2 * reach, 0);
+                let sums = &mut across[before..before + to - from];
+                for (sum, p) in sums.iter_mut().zip(row_at(y)) {
+                    *sum = scaled(u16::from(*p) << LEVEL_BITS, weights[0]);
+                }
+                for (offset, &weight) in weights.iter().enumerate().skip(1) {
+                    let both = row_at(y.saturating_sub(offset)).iter().zip(row_at(y + offset));
+                    for (sum, (above, below)) in sums.iter_mut().zip(both) {
+                        *sum += scaled((u16::from(*above) + u16::from(*below)) << LEVEL_BITS, weight);
+                    }
+                }
+                let (first, last) = (sums[0], sums[sums.len() - 1]);
+                across[..before].fill(first);
+                across[before + to - from..].fill(last);
+                blurred.clear();
+                for at in (0..columns.len()).map(|k| k * CELL + reach) {
+                    let centre = cell_at(&across, at);
+                    let mut sum = [0u16; CELL];
+                    for i in 0..CELL {
+                        sum[i] = scaled(centre[i], weights[0]);
+                    }
+                    for (offset, &weight) in weights.iter().enumerate().skip(1) {
+                        let (left, right) = (cell_at(&across, at - offset), cell_at(&across, at + offset));
+                        for i in 0..CELL {
+                            sum[i] += scaled(left[i] + right[i], weight);
+                        }
+                    }
+                    blurred.push(sum);
+                }
+                let line = blurred.as_flattened_mut();
+                if start == 0 {
+                    line[0] = ground;
+                }
+                // The picture's last pixel, and what cells have beyond it.
+                line[(width - 1 - start).min(count)..].fill(ground);
+                if y == 0 || y == height - 1 {
+                    line.fill(ground);
+                }
+                changes(
+                    line,
+                    |level| is_shape(f32::from(level) / PARTS),
+                    |x, begins| {
+                        if begins {
+                            starts.push(Start { x: start + x, y });
+                        }
+                    },
+                );
+                for (column, part) in columns.clone().zip(&blurred) {
+                    levels[self.cells[row * self.columns + column] + y % CELL * CELL..][..CELL].copy_from_slice(part);
+                }
+            }
+        }
+        (self.across, self.blurred, self.levels) = (across, blurred, levels);
+    }
+}
+
+/// A cell's width of a line.
+fn cell_at(line: &[u16], from: usize) -> [u16; CELL] {
+    let mut cell = [0; CELL];
+    cell.copy_from_slice(&line[from..from + CELL]);
+    cell
+}
+
+/// Weights of a Gaussian kernel, the middle one and those to either side of it, in parts of 2^16.
+fn kernel(sigma: f64) -> Vec<u16> {
+    let reach = (KERNEL_EXTENT * sigma).ceil() as usize;
+    let weights: Vec<f64> = (0..=reach).map(|i| (-(i as f64).powi(2) / (2.0 * sigma * sigma)).exp()).collect();
+    let total = 2.0 * weights.iter().sum::<f64>() - weights[0];
+    let mut parts: Vec<u16> = weights.iter().map(|w| (w / total * 65536.0).round().min(65535.0) as u16).collect();
+    // Rounding must not change the sum, or a uniform picture would change its level.
+    let others: u32 = parts.iter().skip(1).map(|p| 2 * u32::from(*p)).sum();
+    parts[0] = 65536u32.saturating_sub(others).min(65535) as u16;
+    parts
+}
+
+/// A level times a weight in parts of 2^16.
+fn scaled(level: u16, weight: u16) -> u16 {
+    ((u32::from(level) * u32::from(weight)) >> 16) as u16
+}
+
+/// A picture that is blurred near a contour.
+#[derive(Clone, Copy)]
+pub(super) struct Blurred<'a> {
+    pub(super) band: &'a Band,
+    pub(super) raw: Raw<'a>,
+}
+
+impl Picture for Blurred<'_> {
+    fn size(&self) -> [usize; 2] {
+        self.raw.size()
+    }
+
+    fn at(&self, x: usize, y: usize) -> f32 {
+        match self.band.cells[y / CELL * self.band.columns + x / CELL] {
+            OUTSIDE_BAND => self.raw.at(x, y),
+            cell => f32::from(self.band.levels[cell + y % CELL * CELL + x % CELL]) / PARTS,
+        }
+    }
+}
