@@ -2,10 +2,15 @@
 //!
 //! RustDDS announces a participant by multicast only and knows no list of peers. But it takes an announcement in on its
 //! unicast discovery port as well. So the announcements that it multicasts are heard here, on this host, where multicast
-//! comes back to its sender whatever the network does with it, and are sent on to each peer. What they say of multicast
-//! is taken out on the way (a participant is spoken to by multicast if it says it listens there), and addresses that mean
-//! nothing on another host, too. Which port a participant of the peer listens on is given by the RTPS specification
-//! (9.6.1.1) for the first, the second and so on of its host; each of the first [`PARTICIPANTS`] is tried.
+//! comes back to its sender whatever the network does with it, and are sent on to each peer. Which port a participant of
+//! the peer listens on is given by the RTPS specification (9.6.1.1) for the first, the second and so on of its host; each of
+//! the first [`PARTICIPANTS`] is tried.
+//!
+//! A participant is spoken to by multicast if it says that it listens there. Three things keep it from saying so:
+//! what its announcements say of multicast is taken out on the way (and addresses that mean nothing on another host);
+//! so is that it takes announcements in, for a peer that is RustDDS as well would answer with its own as it is; and its
+//! readers, which tell for themselves where they listen, have no multicast: the port for it is kept from them while the
+//! participant opens.
 //!
 //! Both hosts must name each other: an announcement introduces only its sender. Other implementations' lists of initial
 //! peers (Fast DDS, Cyclone DDS) work together with this.
@@ -20,10 +25,11 @@ use socket2::{Domain, Protocol, Socket, Type};
 /// Where participants announce themselves (RTPS 9.6.1.4.1).
 const DISCOVERY_GROUP: Ipv4Addr = Ipv4Addr::new(239, 255, 0, 1);
 
-/// Ports of the RTPS specification (9.6.1.1): base, gain of the domain, offsets of discovery multicast and unicast, gain
-/// of the participant.
+/// Ports of the RTPS specification (9.6.1.1): base, gain of the domain, offsets of user multicast and of discovery
+/// unicast, gain of the participant.
 const PORT_BASE: u16 = 7400;
 const DOMAIN_GAIN: u16 = 250;
+const USER_MULTICAST_OFFSET: u16 = 1;
 const UNICAST_OFFSET: u16 = 10;
 const PARTICIPANT_GAIN: u16 = 2;
 
@@ -34,6 +40,10 @@ pub const PARTICIPANTS: u16 = 16;
 /// (RustDDS: 10 s).
 const REPEAT: Duration = Duration::from_secs(2);
 
+/// How long another process may open its participant at the same time, and how often it is looked whether it has.
+const OPENING: Duration = Duration::from_secs(5);
+const LOOK_PERIOD: Duration = Duration::from_millis(5);
+
 /// Most bytes of a datagram.
 const MOST_BYTES: usize = 65536;
 
@@ -42,34 +52,43 @@ const PREFIX: std::ops::Range<usize> = 8..20;
 const HEADER_LENGTH: usize = 20;
 
 /// A submessage that carries data (9.4.5.3), its flags of byte order and inline quality of service, the writer of
-/// announcements (9.3.1.3), what stands before its content, and a list's head and end (9.4.2.11).
+/// announcements (9.3.1.3), what stands before its content, the heads of a list and of its entries, and a list's end
+/// (9.4.2.11).
 const DATA: u8 = 0x15;
 const LITTLE_ENDIAN: u8 = 1;
 const INLINE_QOS: u8 = 2;
 const ANNOUNCER: [u8; 4] = [0, 1, 0, 0xc2];
 const BEFORE_CONTENT: usize = 20;
 const LIST_HEAD: usize = 4;
+const LIST_ENTRY_HEAD: usize = 4;
 const SENTINEL: u16 = 1;
 
 /// Parameters of an announcement (9.6.2.2): where multicast, and where unicast is listened to.
 const MULTICAST_LOCATORS: [u16; 2] = [0x33, 0x48];
 const UNICAST_LOCATORS: [u16; 2] = [0x31, 0x32];
 
+/// Parameter of an announcement that lists the participant's endpoints as bits (9.3.2.12), and the bit of the one that takes
+/// announcements in.
+const ENDPOINTS: u16 = 0x58;
+const PARTICIPANT_DETECTOR: u32 = 1 << 1;
+
 /// Where the IPv4 address stands in a locator, behind kind, port and twelve zeros.
 const LOCATOR_ADDRESS: std::ops::Range<usize> = 20..24;
 
-/// Hears the announcements made on this host.
+/// Hears the announcements made on this host. To be opened before the participant.
 #[derive(Debug)]
 pub struct Courier {
     socket: UdpSocket,
     domain: u16,
+    /// Keeps the participant from listening to user multicast for as long as it opens.
+    user_multicast: Socket,
 }
 
 impl Courier {
     /// Begins to listen, on the interfaces with these addresses; on all if there are none.
     ///
     /// # Errors
-    /// The system's.
+    /// The system's; [`ErrorKind::AddrInUse`] where a process does not share the port of user multicast.
     pub fn open(domain: u16, interfaces: &[IpAddr]) -> std::io::Result<Self> {
         let socket = Socket::new(Domain::IPV4, Type::DGRAM, Some(Protocol::UDP))?;
         // Participants of this host listen there, too.
@@ -86,7 +105,7 @@ impl Courier {
             return Err(std::io::Error::new(ErrorKind::AddrNotAvailable, "no interface of this host takes multicast"));
         }
         socket.set_read_timeout(Some(REPEAT))?;
-        Ok(Self { socket: socket.into(), domain })
+        Ok(Self { socket: socket.into(), domain, user_multicast: keep_user_multicast(domain)? })
     }
 
     /// Sends the announcements of this participant to the peers for as long as the process lives.
@@ -102,35 +121,53 @@ impl Courier {
         let peers = peers.into_iter().filter(|peer| !own.contains(peer));
         let targets: Vec<SocketAddr> =
             peers.flat_map(|peer| ports.clone().map(move |port| SocketAddr::from((peer, port)))).collect();
-        std::thread::Builder::new().name("static peers".to_owned()).spawn(move || self.run(&prefix[..12], &targets))?;
+        drop(self.user_multicast);
+        let announcements = self.socket;
+        let work = move || run(&announcements, &prefix[..12], &targets);
+        std::thread::Builder::new().name("static peers".to_owned()).spawn(work)?;
         Ok(())
     }
+}
 
-    fn run(&self, prefix: &[u8], targets: &[SocketAddr]) {
-        let mut latest: Vec<u8> = Vec::new();
-        let mut sent = Instant::now();
-        let mut buffer = vec![0; MOST_BYTES];
-        loop {
-            let heard = match self.socket.recv(&mut buffer) {
-                // Other participants, and other talk of this one, come to the group as well.
-                Ok(bytes) => Some(&buffer[..bytes]).filter(|m| m.get(PREFIX) == Some(prefix)).and_then(for_peers),
-                Err(e) if matches!(e.kind(), ErrorKind::WouldBlock | ErrorKind::TimedOut | ErrorKind::Interrupted) => {
-                    None
-                }
-                Err(e) => {
-                    log::warn!("static peers: discovery is no longer heard: {e}");
-                    return;
-                }
-            };
-            let fresh = heard.is_some();
-            latest = heard.unwrap_or(latest);
-            if !latest.is_empty() && (fresh || sent.elapsed() >= REPEAT) {
-                for target in targets {
-                    // A peer that is not there now may be there the next time.
-                    let _ = self.socket.send_to(&latest, target);
-                }
-                sent = Instant::now();
+/// Takes the port of user multicast for this socket alone.
+fn keep_user_multicast(domain: u16) -> std::io::Result<Socket> {
+    let socket = Socket::new(Domain::IPV4, Type::DGRAM, Some(Protocol::UDP))?;
+    let address = SocketAddr::from((Ipv4Addr::UNSPECIFIED, PORT_BASE + DOMAIN_GAIN * domain + USER_MULTICAST_OFFSET));
+    // It goes beside sockets that share the port, and then lets none beside it.
+    socket.set_reuse_address(true)?;
+    let begun = Instant::now();
+    while let Err(error) = socket.bind(&address.into()) {
+        if error.kind() != ErrorKind::AddrInUse || begun.elapsed() > OPENING {
+            return Err(error);
+        }
+        std::thread::sleep(LOOK_PERIOD);
+    }
+    socket.set_reuse_address(false)?;
+    Ok(socket)
+}
+
+fn run(socket: &UdpSocket, prefix: &[u8], targets: &[SocketAddr]) {
+    let mut latest: Vec<u8> = Vec::new();
+    let mut sent = Instant::now();
+    let mut buffer = vec![0; MOST_BYTES];
+    loop {
+        let heard = match socket.recv(&mut buffer) {
+            // Other participants, and other talk of this one, come to the group as well.
+            Ok(bytes) => Some(&buffer[..bytes]).filter(|m| m.get(PREFIX) == Some(prefix)).and_then(for_peers),
+            Err(e) if matches!(e.kind(), ErrorKind::WouldBlock | ErrorKind::TimedOut | ErrorKind::Interrupted) => None,
+            Err(e) => {
+                log::warn!("static peers: discovery is no longer heard: {e}");
+                return;
             }
+        };
+        let fresh = heard.is_some();
+        latest = heard.unwrap_or(latest);
+        if !latest.is_empty() && (fresh || sent.elapsed() >= REPEAT) {
+            for target in targets {
+                // A peer that is not there now may be there the next time.
+                let _ = socket.send_to(&latest, target);
+            }
+            sent = Instant::now();
         }
     }
 }
@@ -150,7 +187,7 @@ fn for_peers(message: &[u8]) -> Option<Vec<u8>> {
         let mut body = after.get(..length)?.to_vec();
         rest = &after[length..];
         if *kind == DATA && flags & INLINE_QOS == 0 && body.get(8..12) == Some(&ANNOUNCER) {
-            body = without_local_locators(&body)?;
+            body = announcement_for_peers(&body)?;
             found = true;
         }
         let length = u16::try_from(body.len()).ok()?;
@@ -165,8 +202,9 @@ fn number(bytes: [u8; 2], little: bool) -> u16 {
     if little { u16::from_le_bytes(bytes) } else { u16::from_be_bytes(bytes) }
 }
 
-/// The body of a submessage with an announcement, without the locators that are of no use on another host.
-fn without_local_locators(body: &[u8]) -> Option<Vec<u8>> {
+/// The body of a submessage with an announcement, without the locators that are of no use on another host and without the
+/// wish for announcements.
+fn announcement_for_peers(body: &[u8]) -> Option<Vec<u8>> {
     let list = BEFORE_CONTENT + LIST_HEAD;
     let mut out = body.get(..list)?.to_vec();
     // The list has a byte order of its own: 0x0003 is little endian, 0x0002 big endian.
@@ -181,8 +219,18 @@ fn without_local_locators(body: &[u8]) -> Option<Vec<u8>> {
         let value = after.get(..length)?;
         let is_loopback =
             value.get(LOCATOR_ADDRESS).is_some_and(|address| address[0] == Ipv4Addr::LOCALHOST.octets()[0]);
-        if !(MULTICAST_LOCATORS.contains(&id) || UNICAST_LOCATORS.contains(&id) && is_loopback) {
-            out.extend(&rest[..4 + length]);
+        match (id, value) {
+            (ENDPOINTS, &[a, b, c, d]) => {
+                out.extend(&rest[..LIST_ENTRY_HEAD]);
+                let bytes = [a, b, c, d];
+                out.extend(if little {
+                    (u32::from_le_bytes(bytes) & !PARTICIPANT_DETECTOR).to_le_bytes()
+                } else {
+                    (u32::from_be_bytes(bytes) & !PARTICIPANT_DETECTOR).to_be_bytes()
+                });
+            }
+            _ if MULTICAST_LOCATORS.contains(&id) || UNICAST_LOCATORS.contains(&id) && is_loopback => {}
+            _ => out.extend(&rest[..LIST_ENTRY_HEAD + length]),
         }
         rest = &after[length..];
     }
@@ -209,6 +257,10 @@ mod tests {
         [&[low, high, 24, 0, 1, 0, 0, 0, 0xf2, 0x1c, 0, 0][..], &[0; 12], &address].concat()
     }
 
+    fn endpoints(bits: u32) -> Vec<u8> {
+        [&ENDPOINTS.to_le_bytes()[..], &[4, 0], &bits.to_le_bytes()].concat()
+    }
+
     fn message(writer: [u8; 4], parameters: &[Vec<u8>]) -> Vec<u8> {
         let header = [b"RTPS".as_slice(), &[2, 3, 1, 0x12], &[7; 12]].concat();
         let timestamp = [0x09, 1, 8, 0, 0, 0, 0, 0, 0, 0, 0, 0];
@@ -218,12 +270,12 @@ mod tests {
     }
 
     #[test]
-    fn peers_hear_of_no_multicast_and_no_loopback() {
+    fn peers_hear_of_no_multicast_no_loopback_and_no_wish_for_announcements() {
         let (here, there) = ([127, 0, 0, 1], [10, 0, 0, 5]);
         let group = DISCOVERY_GROUP.octets();
         let told = [locator(0x32, here), locator(0x32, there), locator(0x33, group), locator(0x31, there)];
-        let heard = for_peers(&message(ANNOUNCER, &[&told[..], &[locator(0x48, group)]].concat()));
-        assert_eq!(heard, Some(message(ANNOUNCER, &[locator(0x32, there), locator(0x31, there)])));
+        let heard = for_peers(&message(ANNOUNCER, &[&told[..], &[locator(0x48, group), endpoints(0xc3f)]].concat()));
+        assert_eq!(heard, Some(message(ANNOUNCER, &[locator(0x32, there), locator(0x31, there), endpoints(0xc3d)])));
     }
 
     #[test]
