@@ -23,6 +23,7 @@ pub mod write;
 
 mod mcap;
 mod metadata;
+mod pages;
 mod queues;
 mod sqlite;
 

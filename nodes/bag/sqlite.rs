@@ -1,11 +1,17 @@
 //! sqlite3 storage: reading schema versions 1 to 4, writing version 4.
+//!
+//! Messages come out by the index of their times. A file that was cut or damaged is read page by page instead (`pages`); the
+//! topics stand in its first pages. The library takes a file that is shorter than its header says for damaged unless it
+//! is told to take the schema as it is (`writable_schema`, here on a connection that cannot write).
 
 use std::collections::HashMap;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
+use rusqlite::config::DbConfig;
 use rusqlite::{Connection, OpenFlags, OptionalExtension, params};
 
+use super::pages::{Pages, Place};
 use super::read::{FileContents, MAX_RECORD_BYTES, MessageIter, Selection};
 use super::write::StorageWriter;
 use super::{BagError, BagWarning, RawMessage, Topic, TopicCount, qos};
@@ -38,6 +44,14 @@ fn damaged(path: &Path, error: &rusqlite::Error) -> BagError {
 pub(super) struct SqliteFile {
     path: PathBuf,
     topics: HashMap<i64, Arc<Topic>>,
+    access: Access,
+}
+
+enum Access {
+    /// By the index of times.
+    Indexed,
+    /// By pages: the messages that were found.
+    Pages(Vec<Place>),
 }
 
 fn connect(path: &Path) -> Result<Connection, BagError> {
@@ -53,16 +67,51 @@ impl SqliteFile {
     /// Reads topics and counts.
     pub(super) fn open(path: &Path) -> Result<(Self, FileContents), BagError> {
         let connection = connect(path)?;
-        let fail = |e: rusqlite::Error| damaged(path, &e);
-        let topics = read_topics(&connection).map_err(fail)?;
-        let mut warning = None;
-        let counts = read_counts(&connection).unwrap_or_else(|e| {
-            warning = Some(e.to_string());
-            Vec::new()
-        });
-        let by_id: HashMap<i64, Arc<Topic>> = topics.iter().cloned().collect();
-        let total: u64 = counts.iter().map(|c| c.messages).sum();
-        let span_ns = counts.iter().map(|c| c.first_ns).min().zip(counts.iter().map(|c| c.last_ns).max());
+        match read_topics(&connection).and_then(|topics| Ok((topics, read_counts(&connection)?))) {
+            // The library takes what is missing of the last page for zeros.
+            Ok(_) if Pages::open(path).is_ok_and(|pages| pages.last_is_cut()) => {
+                Self::salvage(path, "the last page is cut".to_owned())
+            }
+            Ok((topics, counts)) => Ok(Self::with(path, topics, Access::Indexed, &counts, None)),
+            Err(error) => Self::salvage(path, error.to_string()),
+        }
+    }
+
+    /// Looks through a file that is not whole.
+    fn salvage(path: &Path, reason: String) -> Result<(Self, FileContents), BagError> {
+        let connection = connect(path)?;
+        let topics = connection
+            .set_db_config(DbConfig::SQLITE_DBCONFIG_WRITABLE_SCHEMA, true)
+            .and_then(|_| read_topics(&connection))
+            .map_err(|_| BagError::Damaged { path: path.to_owned(), reason: reason.clone() })?;
+        let fail = |source| BagError::Io { path: path.to_owned(), source };
+        let mut pages = Pages::open(path).map_err(fail)?;
+        let mut places = pages.places(|id| topics.iter().any(|(topic, _)| *topic == id));
+        places.retain(|place| pages.data(place).is_some());
+        let mut counts: HashMap<i64, CountRow> = HashMap::new();
+        for &Place { topic_id, time_ns, .. } in &places {
+            let row = counts.entry(topic_id).or_insert(CountRow {
+                topic_id,
+                messages: 0,
+                first_ns: time_ns,
+                last_ns: time_ns,
+            });
+            row.messages += 1;
+            row.last_ns = time_ns;
+        }
+        let counts: Vec<CountRow> = counts.into_values().collect();
+        Ok(Self::with(path, topics, Access::Pages(places), &counts, Some(reason)))
+    }
+
+    fn with(
+        path: &Path,
+        topics: Vec<(i64, Arc<Topic>)>,
+        access: Access,
+        counts: &[CountRow],
+        reason: Option<String>,
+    ) -> (Self, FileContents) {
+        let by_id = topics.iter().cloned().collect();
+        let messages: u64 = counts.iter().map(|c| c.messages).sum();
         let contents = FileContents {
             topics: topics
                 .into_iter()
@@ -71,25 +120,41 @@ impl SqliteFile {
                     messages: counts.iter().find(|c| c.topic_id == id).map_or(0, |c| c.messages),
                 })
                 .collect(),
-            span_ns,
-            warning: warning.map(|reason| BagWarning::Incomplete { path: path.to_owned(), reason, messages: total }),
+            span_ns: counts.iter().map(|c| c.first_ns).min().zip(counts.iter().map(|c| c.last_ns).max()),
+            warning: reason.map(|reason| BagWarning::Incomplete { path: path.to_owned(), reason, messages }),
         };
-        Ok((Self { path: path.to_owned(), topics: by_id }, contents))
+        (Self { path: path.to_owned(), topics: by_id, access }, contents)
     }
 
     /// The messages of the selection, ordered by time.
     pub(super) fn messages(&self, selection: &Selection) -> Result<MessageIter, BagError> {
         let topics = self.topics.iter().filter(|(_, t)| selection.has_topic(&t.name));
+        let topics: HashMap<i64, Arc<Topic>> = topics.map(|(id, t)| (*id, t.clone())).collect();
+        let from_ns = selection.from_ns;
+        if let Access::Pages(places) = &self.access {
+            let fail = |source| BagError::Io { path: self.path.clone(), source };
+            let mut pages = Pages::open(&self.path).map_err(fail)?;
+            let places: Vec<Place> = places.iter().filter(|place| place.time_ns >= from_ns).copied().collect();
+            return Ok(Box::new(places.into_iter().filter_map(move |place| {
+                let topic = topics.get(&place.topic_id)?;
+                pages.data(&place).map(|cdr| Ok(message(topic, place.time_ns, cdr)))
+            })));
+        }
         Ok(Box::new(Rows {
             path: self.path.clone(),
             connection: connect(&self.path)?,
-            topics: topics.map(|(id, t)| (*id, t.clone())).collect(),
+            topics,
             after: None,
-            from_ns: selection.from_ns,
+            from_ns,
             page: Vec::new().into_iter(),
             ended: false,
         }))
     }
+}
+
+/// A message as the storage keeps it: with one time.
+fn message(topic: &Arc<Topic>, time_ns: i64, cdr: Vec<u8>) -> RawMessage {
+    RawMessage { topic: topic.clone(), log_time_ns: time_ns, publish_time_ns: time_ns, cdr }
 }
 
 struct CountRow {
@@ -176,16 +241,21 @@ struct Rows {
 }
 
 impl Rows {
-    fn next_page(&self) -> rusqlite::Result<Vec<Key>> {
+    fn next_page(&self) -> Result<Vec<Key>, BagError> {
+        let fail = |e: rusqlite::Error| damaged(&self.path, &e);
         let (time, id) = self.after.map_or((self.from_ns, i64::MIN), |key| (key.time_ns, key.id));
-        let mut statement = self.connection.prepare_cached(
-            "SELECT timestamp, id, topic_id FROM messages WHERE timestamp >= ?1 AND (timestamp > ?1 OR id > ?2) \
-             ORDER BY timestamp, id LIMIT ?3",
-        )?;
-        let rows = statement.query_map(params![time, id, PAGE_ROWS], |row| {
-            Ok(Key { time_ns: row.get(0)?, id: row.get(1)?, topic_id: row.get(2)? })
-        })?;
-        rows.collect()
+        let sql = "SELECT timestamp, id, topic_id FROM messages WHERE timestamp >= ?1 AND (timestamp > ?1 OR id > ?2) \
+                   ORDER BY timestamp, id LIMIT ?3";
+        let mut statement = self.connection.prepare_cached(sql).map_err(fail)?;
+        let key = |row: &rusqlite::Row<'_>| Ok(Key { time_ns: row.get(0)?, id: row.get(1)?, topic_id: row.get(2)? });
+        let rows = statement.query_map(params![time, id, PAGE_ROWS], key).map_err(fail)?;
+        let page: Vec<Key> = rows.collect::<Result<_, _>>().map_err(fail)?;
+        // A damaged index could lead back to where one was, for ever.
+        if page.is_sorted_by_key(|key| (key.time_ns, key.id)) {
+            return Ok(page);
+        }
+        let reason = "the index of times is out of order".to_owned();
+        Err(BagError::Damaged { path: self.path.clone(), reason })
     }
 
     fn data(&self, id: i64) -> rusqlite::Result<Vec<u8>> {
@@ -193,7 +263,7 @@ impl Rows {
         statement.query_row([id], |row| row.get(0))
     }
 
-    fn step(&mut self) -> Option<rusqlite::Result<RawMessage>> {
+    fn step(&mut self) -> Option<Result<RawMessage, BagError>> {
         loop {
             let Some(key) = self.page.next() else {
                 match self.next_page() {
@@ -207,12 +277,8 @@ impl Rows {
                 }
             };
             let Some(topic) = self.topics.get(&key.topic_id) else { continue };
-            return Some(self.data(key.id).map(|cdr| RawMessage {
-                topic: topic.clone(),
-                log_time_ns: key.time_ns,
-                publish_time_ns: key.time_ns,
-                cdr,
-            }));
+            let data = self.data(key.id).map_err(|e| damaged(&self.path, &e));
+            return Some(data.map(|cdr| message(topic, key.time_ns, cdr)));
         }
     }
 }
@@ -224,7 +290,7 @@ impl Iterator for Rows {
         if self.ended {
             return None;
         }
-        let item = self.step().map(|result| result.map_err(|e| damaged(&self.path, &e)));
+        let item = self.step();
         self.ended = !matches!(item, Some(Ok(_)));
         item
     }

@@ -244,35 +244,71 @@ fn survivors(path: &Path) -> Option<Vec<(i64, String, Vec<u8>)>> {
     Some(messages.filter_map(Result::ok).map(|m| (m.log_time_ns, m.topic.name.clone(), m.cdr)).collect())
 }
 
+/// Where to cut a file: near both ends, where its structure is, at every byte, and in between at every `step`.
+fn cuts(length: usize, step: usize) -> Vec<usize> {
+    let near = 400.min(length / 2);
+    (0..near).chain((near..length - near).step_by(step)).chain(length - near..length).collect()
+}
+
 #[test]
 fn a_bag_cut_anywhere_is_read_up_to_the_cut() {
+    // A prime number, so that the places fall anywhere in pages and records.
+    const STEP: usize = 2999;
     for options in all_options() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("bag");
         write_bag(&path, options);
-        let file = storage_file(&path);
-        let whole = std::fs::read(&file).unwrap();
-        let mut noise = Noise(SEED);
+        let whole = std::fs::read(storage_file(&path)).unwrap();
         let cut = folder.path().join("cut");
         let expected = expected();
-        let mut most = 0;
-        let mut places: Vec<usize> = (0..60).map(|i| whole.len() * i / 60).collect();
-        places.extend((0..60).map(|_| noise.below(whole.len())));
-        places.extend(whole.len() - 40..whole.len());
-        places.sort_unstable();
-        for length in places {
+        let (mut most, mut opened) = (0, 0);
+        for length in cuts(whole.len(), STEP) {
             std::fs::write(&cut, &whole[..length]).unwrap();
-            let Some(read) = survivors(&cut) else { continue };
-            assert!(read.iter().all(|m| expected.contains(m)), "{options:?} cut at {length}");
-            if options.storage == Storage::Mcap {
-                assert!(!BagReader::open(&cut).unwrap().warnings().is_empty(), "{options:?} cut at {length}");
-                assert!(read.len() >= most, "{options:?} cut at {length}: a longer file yields less");
-            }
-            most = most.max(read.len());
+            let Some(read) = survivors(&cut) else {
+                assert_eq!(most, 0, "{options:?} cut at {length}: a longer file can't be opened");
+                continue;
+            };
+            opened += 1;
+            let at = |message: &_| expected.iter().position(|m| m == message);
+            let places: Vec<usize> = read.iter().map_while(at).collect();
+            assert_eq!(places.len(), read.len(), "{options:?} cut at {length}: what was not written");
+            assert!(places.is_sorted(), "{options:?} cut at {length}: out of order");
+            assert!(!BagReader::open(&cut).unwrap().warnings().is_empty(), "{options:?} cut at {length}");
+            assert!(read.len() >= most, "{options:?} cut at {length}: a longer file yields less");
+            most = read.len();
         }
-        if options.storage == Storage::Mcap {
-            assert_eq!(most, MESSAGES, "cutting the summary alone loses no message");
+        assert!(opened > 500, "{options:?}: {opened} of the cuts can be opened");
+        match options.storage {
+            Storage::Mcap => assert_eq!(most, MESSAGES, "cutting the summary alone loses no message"),
+            // The last page may hold some.
+            Storage::Sqlite3 => assert!(most > MESSAGES - 10, "cutting the last byte loses {}", MESSAGES - most),
         }
+    }
+}
+
+#[test]
+fn a_large_sqlite_bag_yields_what_lies_before_the_cut() {
+    const MANY: usize = 20_000;
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("bag");
+    let options = WriterOptions { storage: Storage::Sqlite3, compression: Compression::None };
+    let mut bag = BagWriter::create(&path, options).unwrap();
+    let topic = Topic::known("/camera", "sensor_msgs/msg/CompressedImage", vec![]);
+    let topic = bag.add_topic(topic).unwrap();
+    for i in 0..MANY {
+        let time = i as i64;
+        bag.write(topic, time, time, &content(1 + i % 40)).unwrap();
+    }
+    bag.finish().unwrap();
+    let file = storage_file(&path);
+    let length = std::fs::metadata(&file).unwrap().len();
+    // At a tenth the tree of the table has no root any more that leads anywhere.
+    for tenths in (1..10).rev() {
+        std::fs::File::options().write(true).open(&file).unwrap().set_len(length * tenths / 10).unwrap();
+        let read = survivors(&file).unwrap();
+        assert!(read.iter().map(|m| m.0).eq(0..read.len() as i64), "{tenths} tenths: a gap");
+        let wanted = MANY * tenths as usize / 10;
+        assert!(read.len() > wanted - MANY / 100, "{tenths} tenths: {} of about {wanted}", read.len());
     }
 }
 
