@@ -4,6 +4,7 @@
 #![allow(clippy::unwrap_used, reason = "a test fails by panicking")]
 
 use std::path::Path;
+use std::sync::{Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
 use nix::sys::resource::{Resource, getrlimit, setrlimit};
@@ -16,8 +17,15 @@ mod targets;
 
 use targets::{TARGETS, Target};
 
-/// Address space of this process: what a node is given.
+/// Address space for a target: what a node is given.
 const MEMORY: u64 = 4 << 30;
+
+/// What a target takes more: mcap 0.26 reserves (and never touches) as much as a string claims, up to 4 GiB, which no record
+/// in a chunk can be checked for beforehand. Bags are not read by the nodes.
+const MORE: [(&str, u64); 2] = [("bag_mcap", 8 << 30), ("bag_sqlite", 8 << 30)];
+
+/// The limit is that of the process: one target at a time.
+static TURN: Mutex<()> = Mutex::new(());
 
 /// Damaged copies of each seed.
 const COPIES: usize = 60;
@@ -72,6 +80,13 @@ fn run(target: &Target, input: &[u8], what: &str) {
     assert!(start.elapsed() < PATIENCE, "{}: {what} took {:?}", target.name, start.elapsed());
 }
 
+/// Limits the memory to that of a target.
+fn limit(target: &Target) {
+    let (_, hard) = getrlimit(Resource::RLIMIT_AS).unwrap();
+    let more: u64 = MORE.iter().filter(|(name, _)| *name == target.name).map(|(_, more)| more).sum();
+    setrlimit(Resource::RLIMIT_AS, (MEMORY + more).min(hard), hard).unwrap();
+}
+
 /// For the engine, which begins with them.
 fn write_seeds(folder: &Path, seeds: &[Vec<u8>]) {
     std::fs::create_dir_all(folder).unwrap();
@@ -82,9 +97,9 @@ fn write_seeds(folder: &Path, seeds: &[Vec<u8>]) {
 
 #[test]
 fn damaged_input_gives_errors_and_neither_panics_nor_hangs() {
-    let (_, hard) = getrlimit(Resource::RLIMIT_AS).unwrap();
-    setrlimit(Resource::RLIMIT_AS, MEMORY.min(hard), hard).unwrap();
     for target in TARGETS {
+        let _turn = TURN.lock().unwrap_or_else(PoisonError::into_inner);
+        limit(target);
         let seeds = (target.seeds)();
         assert!(!seeds.is_empty() && seeds.iter().all(|seed| !seed.is_empty()), "{} has no seeds", target.name);
         if let Some(corpus) = std::env::var_os("JIGSAW_FUZZ_CORPUS") {
@@ -103,6 +118,8 @@ fn damaged_input_gives_errors_and_neither_panics_nor_hangs() {
 #[test]
 fn what_once_broke_something_does_so_no_more() {
     for target in TARGETS {
+        let _turn = TURN.lock().unwrap_or_else(PoisonError::into_inner);
+        limit(target);
         let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("fuzz/finds").join(target.name);
         for file in std::fs::read_dir(folder).into_iter().flatten() {
             let path = file.unwrap().path();

@@ -195,8 +195,12 @@ pub fn border(data: &[u8]) {
 
 const PLACE: &str = "/image";
 
+/// Side of the frames in pixels: a piece fits in, [`LARGEST_ANALYSED`] is not reached, and the engine cuts no seed (at 1 MiB).
+const SIDE: u32 = 160;
+
 fn puzzle() -> Option<Puzzle> {
-    Puzzle::generate(&Options { rows: 1, columns: 2, seed: 5, piece_size: Some(60.0), ..Options::default() }).ok()
+    let (piece_size, frame) = (Some(60.0), Some([SIDE, SIDE]));
+    Puzzle::generate(&Options { rows: 1, columns: 2, seed: 5, piece_size, frame, ..Options::default() }).ok()
 }
 
 fn grey_frames() -> Vec<Image> {
@@ -310,15 +314,7 @@ fn parameter_file_seeds() -> Vec<Vec<u8>> {
 }
 
 fn frame_seeds() -> Vec<Vec<u8>> {
-    let shrunk = |image: Image| {
-        // Every other pixel, so that the side fits a byte.
-        let (width, step) = ((image.width / 2).min(255), image.width as usize);
-        let rows = image.data.chunks_exact(step).step_by(2);
-        let mut bytes = vec![width as u8];
-        rows.for_each(|row| bytes.extend(row.iter().step_by(2).take(width as usize)));
-        bytes
-    };
-    grey_frames().into_iter().map(shrunk).collect()
+    grey_frames().into_iter().map(|image| [&[SIDE as u8][..], &image.data].concat()).collect()
 }
 
 fn border_seeds() -> Vec<Vec<u8>> {

@@ -188,6 +188,8 @@ pub(crate) struct Heard {
     pub goals: HashMap<String, Isometry2<f64>>,
     /// When each node has last reported.
     pub reports: HashMap<String, Instant>,
+    /// How much each node says it has published.
+    pub published: HashMap<String, u64>,
 }
 
 impl Heard {
@@ -281,6 +283,10 @@ fn listen(domain: u16, address: Ipv4Addr, peers: Vec<Ipv4Addr>, shared: &(Mutex<
                 report = reports.next() => if let Some(DiagnosticArray { status, .. }) = report {
                     tell(&mut |heard| for s in &status {
                         heard.reports.insert(s.name.clone(), Instant::now());
+                        let published = s.values.iter().find(|value| value.key == "published");
+                        if let Some(count) = published.and_then(|value| value.value.parse().ok()) {
+                            heard.published.insert(s.name.clone(), count);
+                        }
                     });
                 },
                 _ = tick => {}
