@@ -6,7 +6,8 @@
 //! 2. *Gap*: mean distance, clearance taken off, between the piece's border and the nearest border of the assembly,
 //!    wherever there is one near: overlap, underlap and misfit in one figure (the paper's GAP over path length).
 //! 3. *Decision*: how large that figure is for pieces that are placed, and for strangers in the same places, is
-//!    measured; a piece is placed if it fits like one of the former and leads its rivals.
+//!    measured, and how many strangers overlap so much that they drop out; a piece is placed if it fits like one of the
+//!    former, given how many places were tried for it, and leads its rivals.
 //!
 //! Complexity O(pieces left · candidates · neighbours · border). A piece that touches the assembly nowhere, or that
 //! strangers equal, stays left over.
@@ -43,6 +44,23 @@ struct Trial {
     pose: Isometry2<f64>,
     centre: Point,
     cost: f64,
+    /// Candidates by which a place was looked for, for this piece.
+    tries: usize,
+}
+
+/// How pieces fit that are placed, and how strangers do.
+#[derive(Debug, Clone, Copy)]
+struct Fitting {
+    model: Model,
+    /// Logarithm of how rarely a stranger doesn't overlap.
+    rarity: f64,
+}
+
+impl Fitting {
+    /// Logarithm of the odds that a piece belongs where it is tried.
+    fn evidence(&self, trial: &Trial) -> f64 {
+        self.model.evidence(trial.cost) + self.rarity - (trial.tries.max(1) as f64).ln()
+    }
 }
 
 impl Assembler<'_> {
@@ -50,13 +68,13 @@ impl Assembler<'_> {
     pub(super) fn fill(&mut self) {
         while !self.late() {
             let trials = self.trials();
-            let Some(model) = self.fit_of_placed(&trials) else { return };
+            let Some(fitting) = self.fitting(&trials) else { return };
             let best = trials.iter().filter_map(|t| {
-                let evidence = model.evidence(t.cost);
+                let evidence = fitting.evidence(t);
                 let lead = trials
                     .iter()
                     .filter(|o| (o.piece == t.piece) != self.same_place(o, t))
-                    .map(|o| evidence - model.evidence(o.cost))
+                    .map(|o| evidence - fitting.evidence(o))
                     .fold(f64::INFINITY, f64::min);
                 (evidence.min(lead) >= ACCEPT).then_some((evidence, t))
             });
@@ -83,6 +101,10 @@ impl Assembler<'_> {
                 self.take(k);
             }
         }
+        // What fits beside it is judged by where it comes to lie among its neighbours.
+        if self.params.pose_graph {
+            self.adjust(trial.island, COARSE);
+        }
     }
 
     /// Every piece left over in every free place that some candidate leads to; of one place the best pose.
@@ -92,7 +114,10 @@ impl Assembler<'_> {
             .filter(|k| alone(self.edges[*k].a) != alone(self.edges[*k].b) && self.free(*k))
             .map(|k| (k, if alone(self.edges[k].a) { self.edges[k].a } else { self.edges[k].b }))
             .collect();
-        let mut trials: Vec<Trial> = edges.par_iter().filter_map(|(k, piece)| self.trial(*k, *piece)).collect();
+        let mut tries = vec![0; self.outlines.len()];
+        edges.iter().for_each(|(_, piece)| tries[*piece] += 1);
+        let tried = edges.par_iter().filter_map(|(k, piece)| self.trial(*k, *piece));
+        let mut trials: Vec<Trial> = tried.map(|t| Trial { tries: tries[t.piece], ..t }).collect();
         trials.sort_by(|p, q| p.piece.cmp(&q.piece).then(p.cost.total_cmp(&q.cost)).then(p.edge.cmp(&q.edge)));
         let mut kept: Vec<Trial> = Vec::new();
         for t in trials {
@@ -115,7 +140,7 @@ impl Assembler<'_> {
         let pose = self.settled(piece, island, pose);
         let (cost, worst) = self.misfit(piece, island, &pose)?;
         let centre = pose * self.outlines[piece].centroid;
-        (worst <= self.tolerated()).then_some(Trial { piece, edge, island, pose, centre, cost })
+        (worst <= self.tolerated()).then_some(Trial { piece, edge, island, pose, centre, cost, tries: 1 })
     }
 
     /// Pieces of an island near enough to touch a piece in a pose.
@@ -187,9 +212,11 @@ impl Assembler<'_> {
 
     /// How badly pieces fit that are placed, and how badly strangers do in the places that are free; `None` where there
     /// is nothing to try or nothing to learn from.
-    fn fit_of_placed(&self, trials: &[Trial]) -> Option<Model> {
+    fn fitting(&self, trials: &[Trial]) -> Option<Fitting> {
         /// Fewer placed pieces don't show how well they fit.
         const FEW: usize = 4;
+        /// Nine tenths of a normal distribution lie below its mean and this many deviations.
+        const NORMAL_90: f64 = 1.2816;
         /// Strangers fit worse by this much (natural logarithm) if none can be tried.
         const STRANGE: f64 = 1.0;
         if trials.is_empty() {
@@ -202,7 +229,11 @@ impl Assembler<'_> {
         if right.len() < FEW {
             return None;
         }
-        let right = spread_of(&mut right);
+        // Worn pieces make the upper side the wider one.
+        right.sort_by(f64::total_cmp);
+        let upper = (right[right.len() * 9 / 10] - right[right.len() / 2]) / NORMAL_90;
+        let (middle, deviation) = spread_of(&mut right);
+        let right = (middle, deviation.max(upper));
         // Pieces that belong elsewhere, where candidates would put them among the gaps.
         let strangers: Vec<(usize, usize)> = (0..self.edges.len())
             .filter(|k| {
@@ -221,7 +252,8 @@ impl Assembler<'_> {
         };
         let tried = strangers.par_iter().filter_map(|(k, piece)| self.trial(*k, *piece)).filter(elsewhere);
         let mut wrong: Vec<f64> = tried.map(|t| t.cost).collect();
+        let rarity = ((strangers.len() + 1) as f64 / (wrong.len() + 1) as f64).ln();
         let wrong = if wrong.len() < FEW { (right.0 + STRANGE, right.1) } else { spread_of(&mut wrong) };
-        Some(Model::between(right, wrong))
+        Some(Fitting { model: Model::between(right, wrong), rarity })
     }
 }
