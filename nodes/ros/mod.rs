@@ -7,6 +7,7 @@
 //! | [`params`] | declaration, check and documentation of parameters |
 //! | [`services`] | the six parameter services |
 //! | [`lifecycle`] | states and transitions of a managed node |
+//! | `security` | keystore and enclave of SROS2 |
 //! | `server` | one service: requests in, answers out |
 //! | `missed` | asks a client's writer for the request that came before it was known |
 //! | [`topics`] | every topic: message type, name, quality of service |
@@ -29,6 +30,7 @@ pub mod params;
 pub mod peers;
 pub mod process;
 pub mod raw;
+mod security;
 mod server;
 pub mod services;
 pub mod session;

@@ -13,6 +13,7 @@
 //! process where one has gone, so that whoever started it starts it again.
 
 use std::net::{IpAddr, Ipv4Addr};
+use std::path::Path;
 use std::process::ExitCode;
 use std::rc::Rc;
 use std::sync::Arc;
@@ -35,7 +36,7 @@ use super::lifecycle::{AUTOSTART, Activity};
 use super::params::{Default as DefaultValue, ParameterError, Parameters, Rule, Spec};
 use super::session::{Clock, Endpoints, Session, SessionError};
 use super::turn::Turn;
-use super::{logging, missed, peers, services, topics};
+use super::{logging, missed, peers, security, services, topics};
 
 /// Whether the time comes from `/clock`.
 pub const USE_SIM_TIME: Spec = Spec {
@@ -182,7 +183,8 @@ fn help(program: &Program) -> String {
     let mut text = format!(
         "{}\n\nUsage: {} [--ros-args [-r FROM:=TO] [-p NAME:=VALUE] [--params-file FILE]\n       \
          [-r __ns:=/NAMESPACE] [-r __node:=NAME] [--log-level LEVEL] [--]]\n\n\
-         Environment: ROS_DOMAIN_ID, ROS_LOCALHOST_ONLY, ROS_AUTOMATIC_DISCOVERY_RANGE, RUST_LOG\n\nParameters:\n",
+         Environment: ROS_DOMAIN_ID, ROS_LOCALHOST_ONLY, ROS_AUTOMATIC_DISCOVERY_RANGE, RUST_LOG,\n\
+         ROS_SECURITY_ENABLE, ROS_SECURITY_KEYSTORE, ROS_SECURITY_STRATEGY, ROS_SECURITY_ENCLAVE_OVERRIDE\n\nParameters:\n",
         program.about, program.name
     );
     for spec in program.parameters.iter().chain(COMMON_PARAMETERS) {
@@ -350,6 +352,10 @@ impl Process {
             log::debug!("network interfaces: {addresses:?}");
             builder = builder.with_only_networks(addresses.iter().copied());
         }
+        if let Some(enclave) = security::enclave(self.args.enclave.as_deref(), |variable| std::env::var(variable).ok())?
+        {
+            builder = secured(builder, &enclave);
+        }
         let peers = static_peers(parameters, std::env::var("ROS_STATIC_PEERS").ok())?;
         let system = |e: std::io::Error| ProcessError::System { what: "listening to discovery", reason: e.to_string() };
         // Opened before the participant, so that its first announcement is heard.
@@ -373,6 +379,21 @@ fn signals() -> SigSet {
     signals.add(Signal::SIGINT);
     signals.add(Signal::SIGTERM);
     signals
+}
+
+/// The participant's builder with the files of an enclave.
+#[cfg(feature = "security")]
+fn secured(builder: DomainParticipantBuilder, enclave: &Path) -> DomainParticipantBuilder {
+    use rustdds::DomainParticipantSecurityConfigFiles as Files;
+    log::info!("secured by the enclave {}", enclave.display());
+    // The keys of SROS2 have no password.
+    builder.builtin_security(Files::with_ros_default_names(enclave, String::new()))
+}
+
+/// Without the feature there is never an enclave.
+#[cfg(not(feature = "security"))]
+fn secured(builder: DomainParticipantBuilder, _: &Path) -> DomainParticipantBuilder {
+    builder
 }
 
 /// Sets the limit of the address space, unless a lower one is in force.

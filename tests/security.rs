@@ -1,0 +1,149 @@
+//! DDS Security with the real binaries: `cargo test --features security --test security`. The three nodes assemble a puzzle
+//! encrypted and authenticated; a process without a certificate neither hears them nor is heard, and one whose
+//! permissions lack a topic does not get it.
+
+#![allow(clippy::unwrap_used, reason = "a test fails by panicking")]
+
+use std::fs::File;
+use std::path::{Path, PathBuf};
+use std::process::{Child, Command, ExitStatus, Stdio};
+use std::time::{Duration, Instant};
+
+use jigsaw::generate::{Options, Puzzle};
+use jigsaw_msgs::msg::PieceFeatures;
+use ros2_client::{Context, MessageTypeName, Name, NodeName, NodeOptions};
+
+/// How long the secured cell may take; key exchange between all processes takes seconds.
+const PATIENCE: &str = "90";
+
+/// How long one listens that is to hear nothing: several times what an authorised one takes to hear the first thing.
+const SILENCE: &str = "15";
+
+struct Cell {
+    folder: tempfile::TempDir,
+    domain: u16,
+}
+
+impl Cell {
+    fn new(domain: u16) -> Self {
+        let folder = tempfile::tempdir().unwrap();
+        let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("launch-scripts/keystore.sh");
+        let made = Command::new(script)
+            .arg(folder.path().join("keys"))
+            .args(["/cell", "/poor=rt/image"])
+            .stdout(Stdio::null())
+            .status()
+            .unwrap();
+        assert!(made.success());
+        Self { folder, domain }
+    }
+
+    fn path(&self, name: &str) -> PathBuf {
+        self.folder.path().join(name)
+    }
+
+    fn start(&self, binary: &str, enclave: Option<&str>, args: &[&str]) -> Process {
+        let name = Path::new(binary).file_name().unwrap().to_string_lossy();
+        let log = self.path(&format!("{name}_{}.log", enclave.unwrap_or("none").trim_matches('/')));
+        let mut command = Command::new(binary);
+        command.args(args).env("ROS_DOMAIN_ID", self.domain.to_string()).env("ROS_LOCALHOST_ONLY", "1");
+        if let Some(enclave) = enclave {
+            command
+                .env("ROS_SECURITY_ENABLE", "true")
+                .env("ROS_SECURITY_STRATEGY", "Enforce")
+                .env("ROS_SECURITY_KEYSTORE", self.path("keys"))
+                .env("ROS_SECURITY_ENCLAVE_OVERRIDE", enclave);
+        }
+        let out = File::create(&log).unwrap();
+        let child = command.stdout(Stdio::null()).stderr(out).spawn().unwrap();
+        Process { child, log }
+    }
+
+    /// Listens for the assembly; whether it came complete, where it was written, and what was said.
+    fn watch(&self, enclave: Option<&str>, patience: &str) -> (ExitStatus, PathBuf, String) {
+        let out = self.path(&format!("seen_{}", enclave.unwrap_or("none").trim_matches('/')));
+        let args = ["watch", "--timeout", patience, "--pieces", "6", "--out", out.to_str().unwrap()];
+        let mut watcher = self.start(env!("CARGO_BIN_EXE_jigsaw"), enclave, &args);
+        let status = watcher.child.wait().unwrap();
+        (status, out, watcher.said())
+    }
+}
+
+struct Process {
+    child: Child,
+    log: PathBuf,
+}
+
+impl Process {
+    fn said(&self) -> String {
+        std::fs::read_to_string(&self.log).unwrap()
+    }
+}
+
+impl Drop for Process {
+    fn drop(&mut self) {
+        let _ = self.child.kill();
+        let _ = self.child.wait();
+    }
+}
+
+/// Publishes a piece that would be refused with a line, for as long as the cell is given to hear it.
+fn inject(domain: u16, patience: Duration) {
+    let participant = rustdds::DomainParticipantBuilder::new(domain)
+        .with_only_networks([std::net::IpAddr::from([127, 0, 0, 1])])
+        .build()
+        .unwrap();
+    let context = Context::from_domain_participant(participant).unwrap();
+    let options = NodeOptions::new().enable_rosout(false);
+    let mut node = context.new_node(NodeName::new("/", "stranger").unwrap(), options).unwrap();
+    let topic = jigsaw_nodes::ros::topics::PIECE_FEATURES;
+    let name = Name::parse("/pieces/features").unwrap();
+    let kind = MessageTypeName::new("jigsaw_msgs", "PieceFeatures");
+    let topic = node.create_topic(&name, kind, &topic.qos).unwrap();
+    let publisher = node.create_publisher::<PieceFeatures>(&topic, None).unwrap();
+    let end = Instant::now() + patience;
+    while Instant::now() < end {
+        let _ = publisher.publish(PieceFeatures { id: "in/jected".to_owned(), ..PieceFeatures::default() });
+        // A publisher of ten messages a second; nothing is waited for.
+        std::thread::sleep(Duration::from_millis(100));
+    }
+}
+
+#[test]
+fn the_cell_talks_among_itself_alone() {
+    let cell = Cell::new(std::env::var("ROS_DOMAIN_ID").ok().and_then(|id| id.parse().ok()).unwrap_or(80) + 7);
+    let puzzle = Puzzle::generate(&Options { rows: 2, columns: 3, seed: 5, ..Options::default() }).unwrap();
+    let frames = cell.path("frames");
+    std::fs::create_dir(&frames).unwrap();
+    for frame in 0..puzzle.frame_count() {
+        let picture = puzzle.render(frame);
+        let path = frames.join(format!("{}.png", puzzle.frame_stem(frame)));
+        image::save_buffer(path, &picture.pixels, picture.width, picture.height, image::ExtendedColorType::L8).unwrap();
+    }
+    let source = format!("source:={}", frames.display());
+    let solver = cell.start(env!("CARGO_BIN_EXE_solver_node"), Some("/cell"), &[]);
+    let _feature = cell.start(env!("CARGO_BIN_EXE_feature_node"), Some("/cell"), &[]);
+    let _capture = cell.start(env!("CARGO_BIN_EXE_capture_node"), Some("/cell"), &["--ros-args", "-p", &source]);
+
+    let (status, out, _) = cell.watch(Some("/cell"), PATIENCE);
+    assert!(status.success() && out.join("assembly.json").is_file(), "{}", solver.said());
+    assert!(solver.said().contains("secured by the enclave"));
+
+    let (status, out, _) = cell.watch(None, SILENCE);
+    assert!(!status.success() && !out.join("assembly.json").exists(), "one without a certificate hears the cell");
+    let (status, out, said) = cell.watch(Some("/poor"), SILENCE);
+    assert!(!status.success() && !out.join("assembly.json").exists(), "one without the permission hears the cell");
+    assert!(said.contains("rt/assembly"), "{said}");
+
+    inject(cell.domain, Duration::from_secs(5));
+    assert!(!solver.said().contains("jected"), "{}", solver.said());
+}
+
+#[test]
+fn without_its_files_a_node_does_not_start() {
+    let cell = Cell::new(80);
+    let mut node = cell.start(env!("CARGO_BIN_EXE_solver_node"), Some("/nobody"), &[]);
+    assert_eq!(node.child.wait().unwrap().code(), Some(2));
+    let said = node.said();
+    assert!(said.contains("nobody") && said.lines().count() == 1, "{said}");
+}
