@@ -22,7 +22,7 @@ use jigsaw_nodes::ros::actions::{Goal, GoalEnd};
 use jigsaw_nodes::ros::health::Health;
 use jigsaw_nodes::ros::lifecycle::Activity;
 use jigsaw_nodes::ros::params::{Parameters, Spec};
-use jigsaw_nodes::ros::session::Call;
+use jigsaw_nodes::ros::session::{Call, Settings};
 use jigsaw_nodes::ros::transforms::PixelPlane;
 use jigsaw_nodes::{capture, feature, solver};
 use nalgebra::{Isometry2, Vector2};
@@ -67,13 +67,13 @@ fn raw_frames(puzzle: &Puzzle) -> Vec<Frame> {
         .collect()
 }
 
+fn settings(specs: &'static [Spec], health: &Arc<Health>) -> Settings {
+    Settings { parameters: parameters(specs), health: Arc::clone(health), activity: Activity::always() }
+}
+
 fn run_capture(frames: Vec<Frame>, calls: Vec<Call<Trigger>>, health: &Arc<Health>) -> Vec<PieceImage> {
     let (sender, receiver) = mpsc::unbounded();
-    let settings = capture::Settings {
-        parameters: parameters(capture::params::PARAMETERS),
-        health: Arc::clone(health),
-        activity: Activity::always(),
-    };
+    let settings = settings(capture::params::PARAMETERS, health);
     let requests = capture::Requests { calls: stream::iter(calls), forgets: stream::empty() };
     smol::block_on(capture::run(stream::iter(frames), requests, sender, settings));
     smol::block_on(receiver.collect())
@@ -81,11 +81,7 @@ fn run_capture(frames: Vec<Frame>, calls: Vec<Call<Trigger>>, health: &Arc<Healt
 
 fn run_feature(pieces: Vec<PieceImage>, health: &Arc<Health>) -> Vec<PieceFeatures> {
     let (sender, receiver) = mpsc::unbounded();
-    let settings = feature::Settings {
-        parameters: parameters(feature::params::PARAMETERS),
-        health: Arc::clone(health),
-        activity: Activity::always(),
-    };
+    let settings = settings(feature::params::PARAMETERS, health);
     let (images, _) = mpsc::channel(0);
     let overlays = feature::Overlays { images, wanted: Box::new(|| false) };
     smol::block_on(feature::run(stream::iter(pieces), sender, overlays, settings));
@@ -115,11 +111,7 @@ fn run_solver_with_goals(
     let (marker, markers) = mpsc::channel(room);
     let (solutions, _) = mpsc::unbounded();
     let outputs = solver::Outputs { assembly, transforms: transform, markers: marker, solutions, journal: None };
-    let settings = solver::Settings {
-        parameters: parameters(solver::params::PARAMETERS),
-        health: Arc::clone(health),
-        activity: Activity::always(),
-    };
+    let settings = settings(solver::params::PARAMETERS, health);
     let requests = solver::Requests {
         resets: stream::iter(resets),
         solves: stream::empty(),

@@ -23,10 +23,10 @@ use jigsaw_msgs::msg::PieceImage;
 use jigsaw_msgs::std_srvs::srv::{Trigger, TriggerResponse};
 
 use crate::ros::health::Health;
-use crate::ros::lifecycle::{Activity, Forget, WhileInactive};
+use crate::ros::lifecycle::{Forget, WhileInactive};
 use crate::ros::params::Parameters;
 use crate::ros::process::{ProcessError, Program, Work};
-use crate::ros::session::{Call, Session};
+use crate::ros::session::{Call, Session, Settings};
 use crate::ros::topics;
 use convert::{FrameError, FrameHead};
 use known::{FrameName, Known};
@@ -41,17 +41,6 @@ pub const PROGRAM: Program = Program {
             Service:    capture (std_srvs/Trigger): take the pieces in view, or the folder, again",
     parameters: params::PARAMETERS,
 };
-
-/// What the loop needs beside its streams.
-#[derive(Debug, Clone)]
-pub struct Settings {
-    /// Parameters, looked at with every frame.
-    pub parameters: Arc<Parameters>,
-    /// Counters.
-    pub health: Arc<Health>,
-    /// Whether the node works.
-    pub activity: Activity,
-}
 
 /// A frame after the workers.
 struct Seen {
@@ -91,11 +80,7 @@ impl Heard {
 /// # Errors
 /// An empty or missing folder; a name that is no name; a refusal of the middleware.
 pub fn open(mut session: Session, pieces: impl Sink<PieceImage> + Unpin + 'static) -> Result<Work, ProcessError> {
-    let settings = Settings {
-        parameters: Arc::clone(&session.parameters),
-        health: Arc::clone(&session.health),
-        activity: session.activity.clone(),
-    };
+    let settings = session.settings();
     let calls = session.serve::<Trigger>(topics::CAPTURE_SERVICE)?;
     let folder = params::source_folder(&session.parameters);
     let frames: LocalBoxStream<'static, Frame> = match folder.clone() {

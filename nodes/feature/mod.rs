@@ -4,8 +4,6 @@ pub mod convert;
 pub mod params;
 pub mod share;
 
-use std::sync::Arc;
-
 use futures::channel::mpsc;
 use futures::{Sink, SinkExt, Stream, StreamExt};
 use isthmus::Extractor;
@@ -14,11 +12,9 @@ use jigsaw_msgs::sensor_msgs::msg::Image;
 
 use crate::capture::params::threads;
 use crate::picture::{InspectionStyle, inspection};
-use crate::ros::health::Health;
-use crate::ros::lifecycle::{Activity, Forget, WhileInactive};
-use crate::ros::params::Parameters;
+use crate::ros::lifecycle::{Forget, WhileInactive};
 use crate::ros::process::{ProcessError, Program, Work};
-use crate::ros::session::{Audience, CHANNEL_DEPTH, Session};
+use crate::ros::session::{Audience, CHANNEL_DEPTH, Session, Settings};
 use crate::ros::topics;
 use convert::PieceImageError;
 
@@ -47,17 +43,6 @@ impl Overlays {
     fn new(images: mpsc::Sender<Image>, audience: Audience) -> Self {
         Self { images, wanted: Box::new(move || audience.count() > 0) }
     }
-}
-
-/// What the loop needs beside its streams.
-#[derive(Debug, Clone)]
-pub struct Settings {
-    /// Parameters.
-    pub parameters: Arc<Parameters>,
-    /// Counters.
-    pub health: Arc<Health>,
-    /// Whether the node works.
-    pub activity: Activity,
 }
 
 /// Opens the node with its own topics, sharing the pieces with other feature nodes if it is told to, and gives its loop.
@@ -89,11 +74,7 @@ pub fn open(
 ) -> Result<Work, ProcessError> {
     let (images, audience) = session.publish(&topics::OVERLAY)?;
     let overlays = Overlays::new(images, audience);
-    let settings = Settings {
-        parameters: Arc::clone(&session.parameters),
-        health: Arc::clone(&session.health),
-        activity: session.activity.clone(),
-    };
+    let settings = session.settings();
     let pieces = session.activity.gate(pieces, WhileInactive::Hold);
     let forgets = session.manage(|| Ok(()))?;
     // There is nothing to forget: each piece is looked at on its own.

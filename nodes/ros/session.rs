@@ -57,6 +57,17 @@ pub struct Call<S: Service> {
     pub reply: oneshot::Sender<S::Response>,
 }
 
+/// What the loop of a node needs beside its streams.
+#[derive(Debug, Clone)]
+pub struct Settings {
+    /// Parameters; a loop looks at them with every message.
+    pub parameters: Arc<Parameters>,
+    /// Counters.
+    pub health: Arc<Health>,
+    /// Whether the node works.
+    pub activity: Activity,
+}
+
 /// What discovery has told of the endpoints of this process.
 #[derive(Debug, Clone, Default)]
 pub(super) struct Endpoints(Arc<Mutex<EndpointTable>>);
@@ -181,6 +192,12 @@ impl Session {
     /// The names of the node.
     pub fn names(&self) -> &NodeNames {
         &self.names
+    }
+
+    /// What the node's loop needs of this session.
+    pub fn settings(&self) -> Settings {
+        let Self { parameters, health, activity, .. } = self;
+        Settings { parameters: Arc::clone(parameters), health: Arc::clone(health), activity: activity.clone() }
     }
 
     /// Runs something beside the node's loop for as long as the process lives.

@@ -28,7 +28,7 @@ use crate::ros::health::Health;
 use crate::ros::lifecycle::{Activity, Forget, WhileInactive};
 use crate::ros::params::Parameters;
 use crate::ros::process::{ProcessError, Program, Work};
-use crate::ros::session::{Call, Session};
+use crate::ros::session::{Call, Session, Settings};
 use crate::ros::topics;
 use convert::{FeaturesError, Naming, Sighting, Solution};
 use journal::{Journal, JournalError};
@@ -126,11 +126,7 @@ pub fn open(
     };
     let (images, audience) = session.publish(&topics::ASSEMBLY_IMAGE)?;
     session.spawn(draw(solutions, images, move || audience.count() > 0));
-    let settings = Settings {
-        parameters: Arc::clone(&session.parameters),
-        health: Arc::clone(&session.health),
-        activity: session.activity.clone(),
-    };
+    let settings = session.settings();
     let features = session.activity.gate(features, WhileInactive::Hold);
     let forgets = session.manage(|| Ok(()))?;
     Ok(Box::pin(async move {
@@ -151,17 +147,6 @@ pub struct Requests<R, S, G, F> {
     pub goals: G,
     /// Wishes to forget all pieces.
     pub forgets: F,
-}
-
-/// What the loop needs beside its streams.
-#[derive(Debug, Clone)]
-pub struct Settings {
-    /// Parameters, looked at with every solution.
-    pub parameters: Arc<Parameters>,
-    /// Counters.
-    pub health: Arc<Health>,
-    /// Whether the node works.
-    pub activity: Activity,
 }
 
 /// The node's loop. Begins with the pieces of the journal. Ends, after a last solution, when shapes and requests have ended.
