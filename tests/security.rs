@@ -7,17 +7,28 @@
 use std::fs::File;
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, ExitStatus, Stdio};
-use std::time::{Duration, Instant};
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::Duration;
 
 use jigsaw::generate::{Options, Puzzle};
-use jigsaw_msgs::msg::PieceFeatures;
+use jigsaw_msgs::Message;
+use jigsaw_msgs::msg::{Assembly, PieceFeatures};
+use jigsaw_nodes::ros::topics::{self, Topic};
 use ros2_client::{Context, MessageTypeName, Name, NodeName, NodeOptions};
 
 /// How long the secured cell may take; key exchange between all processes takes seconds.
 const PATIENCE: &str = "90";
 
 /// How long one listens that is to hear nothing: several times what an authorised one takes to hear the first thing.
-const SILENCE: &str = "15";
+const SILENCE: &str = "10";
+
+/// Pieces of the puzzle: two rows, three columns.
+const PIECES: usize = 6;
+
+/// Domains that no other test is in.
+fn first_domain() -> u16 {
+    std::env::var("ROS_DOMAIN_ID").ok().and_then(|id| id.parse().ok()).unwrap_or(80)
+}
 
 struct Cell {
     folder: tempfile::TempDir,
@@ -60,9 +71,10 @@ impl Cell {
     }
 
     /// Listens for the assembly; whether it came complete, where it was written, and what was said.
-    fn watch(&self, enclave: Option<&str>, patience: &str) -> (ExitStatus, PathBuf, String) {
+    fn watch(&self, enclave: Option<&str>, patience: &str, pieces: usize) -> (ExitStatus, PathBuf, String) {
         let out = self.path(&format!("seen_{}", enclave.unwrap_or("none").trim_matches('/')));
-        let args = ["watch", "--timeout", patience, "--pieces", "6", "--out", out.to_str().unwrap()];
+        let pieces = pieces.to_string();
+        let args = ["watch", "--timeout", patience, "--pieces", &pieces, "--out", out.to_str().unwrap()];
         let mut watcher = self.start(env!("CARGO_BIN_EXE_jigsaw"), enclave, &args);
         let status = watcher.child.wait().unwrap();
         (status, out, watcher.said())
@@ -87,8 +99,8 @@ impl Drop for Process {
     }
 }
 
-/// Publishes a piece that would be refused with a line, for as long as the cell is given to hear it.
-fn inject(domain: u16, patience: Duration) {
+/// Publishes a message again and again, without a certificate, while something else is done.
+fn injecting<M: Message, T>(domain: u16, topic: &Topic<M>, message: M, action: impl FnOnce() -> T) -> T {
     let participant = rustdds::DomainParticipantBuilder::new(domain)
         .with_only_networks([std::net::IpAddr::from([127, 0, 0, 1])])
         .build()
@@ -96,22 +108,39 @@ fn inject(domain: u16, patience: Duration) {
     let context = Context::from_domain_participant(participant).unwrap();
     let options = NodeOptions::new().enable_rosout(false);
     let mut node = context.new_node(NodeName::new("/", "stranger").unwrap(), options).unwrap();
-    let topic = jigsaw_nodes::ros::topics::PIECE_FEATURES;
-    let name = Name::parse("/pieces/features").unwrap();
-    let kind = MessageTypeName::new("jigsaw_msgs", "PieceFeatures");
-    let topic = node.create_topic(&name, kind, &topic.qos).unwrap();
-    let publisher = node.create_publisher::<PieceFeatures>(&topic, None).unwrap();
-    let end = Instant::now() + patience;
-    while Instant::now() < end {
-        let _ = publisher.publish(PieceFeatures { id: "in/jected".to_owned(), ..PieceFeatures::default() });
-        // A publisher of ten messages a second; nothing is waited for.
-        std::thread::sleep(Duration::from_millis(100));
-    }
+    let name = Name::parse(&format!("/{}", topic.name)).unwrap();
+    let kind = MessageTypeName::new(M::TYPE.package, M::TYPE.name);
+    let dds_topic = node.create_topic(&name, kind, &topic.qos).unwrap();
+    let publisher = node.create_publisher::<M>(&dds_topic, None).unwrap();
+    let done = AtomicBool::new(false);
+    std::thread::scope(|scope| {
+        scope.spawn(|| {
+            while !done.load(Ordering::Relaxed) {
+                let _ = publisher.publish(message.clone());
+                // A publisher of ten messages a second; nothing is waited for.
+                std::thread::sleep(Duration::from_millis(100));
+            }
+        });
+        let result = action();
+        done.store(true, Ordering::Relaxed);
+        result
+    })
+}
+
+#[test]
+fn a_forged_assembly_reaches_the_unprotected_alone() {
+    let cell = Cell::new(first_domain() + 8);
+    let forged = Assembly { state: Assembly::COMPLETE, ..Assembly::default() };
+    injecting(cell.domain, &topics::ASSEMBLY, forged, || {
+        assert!(cell.watch(None, PATIENCE, 0).0.success(), "the forged assembly is one that a listener takes");
+        let (status, out, _) = cell.watch(Some("/cell"), SILENCE, 0);
+        assert!(!status.success() && !out.join("assembly.json").exists(), "a secured listener hears a stranger");
+    });
 }
 
 #[test]
 fn the_cell_talks_among_itself_alone() {
-    let cell = Cell::new(std::env::var("ROS_DOMAIN_ID").ok().and_then(|id| id.parse().ok()).unwrap_or(80) + 7);
+    let cell = Cell::new(first_domain() + 7);
     let puzzle = Puzzle::generate(&Options { rows: 2, columns: 3, seed: 5, ..Options::default() }).unwrap();
     let frames = cell.path("frames");
     std::fs::create_dir(&frames).unwrap();
@@ -125,23 +154,27 @@ fn the_cell_talks_among_itself_alone() {
     let _feature = cell.start(env!("CARGO_BIN_EXE_feature_node"), Some("/cell"), &[]);
     let _capture = cell.start(env!("CARGO_BIN_EXE_capture_node"), Some("/cell"), &["--ros-args", "-p", &source]);
 
-    let (status, out, _) = cell.watch(Some("/cell"), PATIENCE);
+    let (status, out, _) = cell.watch(Some("/cell"), PATIENCE, PIECES);
     assert!(status.success() && out.join("assembly.json").is_file(), "{}", solver.said());
     assert!(solver.said().contains("secured by the enclave"));
 
-    let (status, out, _) = cell.watch(None, SILENCE);
+    let (status, out, _) = cell.watch(None, SILENCE, PIECES);
     assert!(!status.success() && !out.join("assembly.json").exists(), "one without a certificate hears the cell");
-    let (status, out, said) = cell.watch(Some("/poor"), SILENCE);
+    let (status, out, said) = cell.watch(Some("/poor"), SILENCE, PIECES);
     assert!(!status.success() && !out.join("assembly.json").exists(), "one without the permission hears the cell");
     assert!(said.contains("rt/assembly"), "{said}");
 
-    inject(cell.domain, Duration::from_secs(5));
+    let strange = PieceFeatures { id: "in/jected".to_owned(), ..PieceFeatures::default() };
+    injecting(cell.domain, &topics::PIECE_FEATURES, strange, || {
+        let (status, out, _) = cell.watch(Some("/cell"), PATIENCE, PIECES);
+        assert!(status.success() && out.join("assembly.json").is_file(), "{}", solver.said());
+    });
     assert!(!solver.said().contains("jected"), "{}", solver.said());
 }
 
 #[test]
 fn without_its_files_a_node_does_not_start() {
-    let cell = Cell::new(80);
+    let cell = Cell::new(first_domain());
     let mut node = cell.start(env!("CARGO_BIN_EXE_solver_node"), Some("/nobody"), &[]);
     assert_eq!(node.child.wait().unwrap().code(), Some(2));
     let said = node.said();
