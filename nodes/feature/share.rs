@@ -4,8 +4,8 @@
 //! Ravishankar 1998): all of them come to the same order without a word. The first works on the piece at once; the others
 //! keep it until the result is heard, and the second takes it over where none comes in time, and so on. A node whose share
 //! had to be taken over ranks last until it is heard again, so that a dead node delays only the pieces that were under
-//! way. A node also keeps the results of the others, and publishes those of a node that has gone: whoever comes later
-//! finds all pieces all the same.
+//! way. A node also keeps the results of the others, and publishes those of a node that has gone or is silent: whoever comes
+//! later, or has not heard them before, finds all pieces all the same.
 //!
 //! A piece that two nodes work on does no harm: the solver knows it by its content. `O(n)` for `n` nodes a piece.
 
@@ -106,10 +106,12 @@ impl Share {
         pieces
     }
 
-    /// The results of nodes that have gone, where this node is the one to keep them for those who come later.
+    /// The results of nodes that have gone or are silent, where this node is the one to keep them for those who come later,
+    /// and for those whom they have not reached yet.
     pub fn inherit(&mut self, others: &[GUID]) -> Vec<PieceFeatures> {
         let alive: HashSet<Member> = others.iter().map(|other| other.to_bytes()).collect();
-        let gone = self.results.iter().filter(|(_, (by, _))| !alive.contains(by));
+        let silent = &self.silent;
+        let gone = self.results.iter().filter(|(_, (by, _))| !alive.contains(by) || silent.contains(by));
         let ids: Vec<String> = gone.map(|(id, _)| id.clone()).collect();
         let mut mine = Vec::new();
         for id in ids {
@@ -238,5 +240,16 @@ mod tests {
         assert_eq!(kept.iter().map(Vec::len).sum::<usize>(), 100);
         assert!(kept.iter().all(|share| share.len() > 20));
         assert!(first.inherit(&[guid(1)]).is_empty());
+    }
+
+    #[test]
+    fn what_a_silent_node_has_published_is_published_again() {
+        let mut node = Share::new(guid(0));
+        let (others, now) = ([guid(1)], Instant::now());
+        node.heard(result("heard"), guid(1));
+        let left = (0..).map(piece).find(|piece| node.offer(piece.clone(), &others, now).is_none()).unwrap();
+        assert!(node.inherit(&others).is_empty());
+        assert_eq!(node.overdue(now + 2 * PATIENCE), [left]);
+        assert_eq!(node.inherit(&others), [result("heard")]);
     }
 }
