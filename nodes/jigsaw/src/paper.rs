@@ -12,10 +12,11 @@
 
 use crate::correlation::correlate;
 use crate::outline::{Outline, Segment};
-use crate::placement::{as_posed, rigid_fit};
+use crate::placement::{Fit, rigid_fit};
 use crate::search::Joint;
 use crate::{Rule, TableCounts};
 use isthmus::Point;
+use nalgebra::{Isometry2, Matrix3};
 use rayon::prelude::*;
 
 /// Least value of Eq. 1.
@@ -28,6 +29,9 @@ const OVERLAP: f64 = 0.5;
 const TAKING_PART: f64 = 0.75;
 /// Greatest offset tried, in samples.
 const REACH: i64 = 24;
+
+/// Gaps count at most this, in piece scales.
+const FAR: f64 = 0.2;
 
 /// One IDF with its points, at steps of `step` pixels of path.
 struct Profile {
@@ -90,13 +94,32 @@ impl<'a> Judge<'a> {
         let to = f.points.len().min((best.offset + g.points.len() as i64).max(0) as usize);
         let shifted = (from as i64 - best.offset).max(0) as usize;
         let pose = rigid_fit(&f.points[from..to], &g.points[shifted..]);
-        let fit = as_posed(other, segment, &pose, self.outlines[b].scale).ok_or(Rule::Overlap)?;
-        let gap = fit.pos_gap + fit.neg_gap;
-        if fit.pos_gap > OVERLAP * gap {
+        let (pos_gap, neg_gap) = self.gaps(&f.points, b, &pose, other.path);
+        if pos_gap > OVERLAP * (pos_gap + neg_gap) {
             return Err(Rule::Overlap);
         }
-        let ave_gap = gap / other.path;
-        Ok(Joint { a, tab, b, mouth, fit: crate::placement::Fit { ave_gap, residual: ave_gap, ..fit } })
+        let ave_gap = (pos_gap + neg_gap) / other.path;
+        let fit = Fit {
+            negative_from_positive: pose,
+            clearance: 0.0,
+            residual: ave_gap,
+            ave_gap,
+            pos_gap,
+            neg_gap,
+            information: Matrix3::identity(),
+        };
+        Ok(Joint { a, tab, b, mouth, fit })
+    }
+
+    /// Areas of overlap and underlap between the points of a neck's segment, posed, and the border of a piece.
+    fn gaps(&self, points: &[Point], piece: usize, pose: &Isometry2<f64>, path: f64) -> (f64, f64) {
+        let outline = self.outlines[piece];
+        let reach = FAR * outline.scale;
+        let width = path / points.len() as f64;
+        points
+            .iter()
+            .map(|p| outline.gap(pose * p, reach).unwrap_or(reach))
+            .fold((0.0, 0.0), |(pos, neg), d| if d < 0.0 { (pos - d * width, neg) } else { (pos, neg + d * width) })
     }
 }
 

@@ -477,27 +477,14 @@ fn figures(
     }
 }
 
-/// The figures of a given pose, unrefined, with no clearance: for the rules of the paper.
-pub(crate) fn as_posed(tab: &Segment, mouth: &Segment, pose: &Isometry2<f64>, scale: f64) -> Option<Fit> {
-    let pose = Pose::between(tab, mouth, pose);
-    let mut feet = Feet::default();
-    feet.start_with_nodes(tab, mouth, 1);
-    feet.settle(mouth, &pose);
-    feet.find(mouth, &pose);
-    if feet.distances(feet.core.clone()).count() < (tab.core.len() / 2).max(1) {
-        return None;
-    }
-    let residual = feet.residual(feet.core.clone(), 0.0, f64::INFINITY);
-    Some(figures(tab, mouth, &feet, &pose, 0.0, (residual, RESIDUAL_CAP * scale), tab.step))
-}
-
-/// Best rigid pose that takes points `a` to points `b` (Umeyama 1991 without scale).
+/// Best rigid pose that takes points `a` to points `b`, pair by pair as far as both go (Umeyama 1991 without scale).
 pub fn rigid_fit(a: &[Point2<f64>], b: &[Point2<f64>]) -> Isometry2<f64> {
-    let n = a.len().min(b.len()).max(1) as f64;
-    let ma = a.iter().fold(Vector2::zeros(), |s, p| s + p.coords) / n;
-    let mb = b.iter().fold(Vector2::zeros(), |s, p| s + p.coords) / n;
+    let pairs = || a.iter().zip(b);
+    let n = pairs().count().max(1) as f64;
+    let ma = pairs().fold(Vector2::zeros(), |s, (p, _)| s + p.coords) / n;
+    let mb = pairs().fold(Vector2::zeros(), |s, (_, q)| s + q.coords) / n;
     let (mut dot, mut cross) = (0.0, 0.0);
-    for (p, q) in a.iter().zip(b) {
+    for (p, q) in pairs() {
         let (p, q) = (p.coords - ma, q.coords - mb);
         dot += p.dot(&q);
         cross += p.x * q.y - p.y * q.x;

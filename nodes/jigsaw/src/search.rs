@@ -23,6 +23,7 @@ use crate::solver::Budget;
 use crate::{Params, Policy, placement};
 use nalgebra::{Isometry2, Matrix3, Point2, Translation2, UnitComplex, Vector2, Vector3};
 use state::{Slots, State};
+use std::cmp::Reverse;
 use std::collections::{BTreeMap, HashMap};
 
 /// Overlap of two pieces that can't be a matter of drift or clearance, in squared piece scales.
@@ -304,14 +305,14 @@ impl Assembler<'_> {
     }
 
     /// The paper's assembly: down the ranked table, mating whatever fits without intolerable overlap; when pieces are
-    /// left that can't be joined up, back. Decisions are taken back by limited discrepancy search (Harvey and
+    /// left that can't be joined up, or mouths that nothing fills, back. Decisions are taken back by limited discrepancy search (Harvey and
     /// Ginsberg 1995): every descent that differs from the greedy one in one decision, the weakest first, then in two.
     fn descend(&mut self, joints: &[Joint]) -> Outcome {
         let n = self.outlines.len();
         let mut ranked: Vec<usize> = (0..self.edges.len()).collect();
         ranked.sort_by(|p, q| self.edges[*p].cost.total_cmp(&self.edges[*q].cost).then(p.cmp(q)));
         let mut queue = std::collections::VecDeque::from([Vec::new()]);
-        let mut best: Option<(usize, State)> = None;
+        let mut best: Option<((usize, Reverse<usize>), State)> = None;
         while let Some(skipped) = queue.pop_front() {
             self.state = State::new(&self.slots);
             let mut decisions = Vec::new();
@@ -320,11 +321,11 @@ impl Assembler<'_> {
                     decisions.push(k);
                 }
             }
-            let placed = self.state.largest();
-            if best.as_ref().is_none_or(|b| placed > b.0) {
-                best = Some((placed, self.state.clone()));
+            let worth = (self.state.largest(), Reverse(self.open_mouths()));
+            if best.as_ref().is_none_or(|b| worth > b.0) {
+                best = Some((worth, self.state.clone()));
             }
-            if placed == n || self.backtracks >= self.params.backtracks || self.late() {
+            if worth == (n, Reverse(0)) || self.backtracks >= self.params.backtracks || self.late() {
                 break;
             }
             self.backtracks += 1;
@@ -344,6 +345,24 @@ impl Assembler<'_> {
         let trusted = self.state.joined().to_vec();
         self.learn(&trusted);
         self.finish_sure(joints)
+    }
+
+    /// Mouths of placed pieces in whose middle no other piece of their island lies.
+    fn open_mouths(&self) -> usize {
+        let filled = |piece: usize, at: Point2<f64>| {
+            self.state.members(self.state.island(piece)).filter(|q| *q != piece).any(|q| {
+                let raster = &self.outlines[q].raster;
+                raster.cell_of(self.state.pose[q].inverse() * at).is_some_and(|cell| raster.distance[cell] < 0.0)
+            })
+        };
+        let placed = (0..self.outlines.len()).filter(|k| !self.state.alone(*k));
+        let mouths = placed.flat_map(|k| self.outlines[k].mouths.iter().map(move |mouth| (k, mouth)));
+        mouths
+            .filter(|(k, mouth)| {
+                let middle = mouth.origin + Vector2::new(f64::from(mouth.middle[0]), f64::from(mouth.middle[1]));
+                !filled(*k, self.state.pose[*k] * middle)
+            })
+            .count()
     }
 
     fn late(&mut self) -> bool {

@@ -79,16 +79,24 @@ fn the_literal_rules_thin_out_the_table_step_by_step() {
     assert!(t.pairs > t.after_overlap && t.after_overlap >= 7, "{t:?}");
 }
 
-/// The greedy descent of the paper takes a wrong pair early, after which pieces can't be joined up.
+/// The greedy descent of the paper takes wrong pairs, after which pieces can't be joined up or mouths stay open. Going back
+/// mends that in some puzzles, and spoils none.
 #[test]
 fn backtracking_mends_what_the_greedy_descent_spoils() {
-    let options = Options { rows: 3, columns: 3, clearance: [0.2, 0.2], seed: 7, ..Options::default() };
-    let paper = |backtracks| Params { policy: Policy::Paper, backtracks, ..Params::default() };
-    let (greedy, _) = solve(&options, &paper(0));
-    assert!(greedy.misplaced > 0 && !greedy.is_perfect(), "{greedy:?}");
-    let (mended, assembly) = solve(&options, &paper(1000));
-    assert!(mended.is_perfect(), "{mended:?}");
-    assert!(assembly.table.backtracks > 0 && assembly.unplaced.is_empty(), "{:?}", assembly.table);
+    let (mut spoilt, mut mended) = (0, 0);
+    for seed in 1..9 {
+        let options = Options { rows: 3, columns: 4, clearance: [0.5, 0.5], seed, ..Options::default() };
+        let paper = |backtracks| Params { policy: Policy::Paper, backtracks, ..Params::default() };
+        let (greedy, _) = solve(&options, &paper(0));
+        let (backtracked, assembly) = solve(&options, &paper(300));
+        assert!(backtracked.is_perfect() || !greedy.is_perfect(), "seed {seed}: {backtracked:?}");
+        spoilt += usize::from(!greedy.is_perfect());
+        if backtracked.is_perfect() && !greedy.is_perfect() {
+            mended += 1;
+            assert!(assembly.table.backtracks > 0, "seed {seed}: {:?}", assembly.table);
+        }
+    }
+    assert!(spoilt > 0 && mended > 0, "{mended} of {spoilt} mended");
 }
 
 #[test]
