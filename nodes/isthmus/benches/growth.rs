@@ -1,6 +1,6 @@
 //! Growth of the cost with the frame's size: one piece of 300 px for each megapixel, least time of several runs, one thread.
 //!
-//! `cargo bench -p isthmus --bench growth` for all sizes, `cargo bench -p isthmus --bench growth -- 1024` for one.
+//! `cargo bench -p isthmus-shapes --bench growth` for all sizes, `cargo bench -p isthmus-shapes --bench growth -- 1024` for one.
 
 #![allow(missing_docs, clippy::unwrap_used, reason = "bench program")]
 

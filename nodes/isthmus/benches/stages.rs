@@ -1,6 +1,6 @@
 //! Time of each stage on a 1024 x 1024 frame with one piece, on a 12-megapixel frame with 30 pieces, and of what one would use instead.
 //!
-//! `cargo bench -p isthmus`
+//! `cargo bench -p isthmus-shapes`
 
 #![allow(missing_docs, clippy::unwrap_used, reason = "bench program")]
 

@@ -1,6 +1,6 @@
 //! The tightest passages of a floor map: on an occupancy grid, where is a robot of a given width stuck, and where does it just pass?
 //!
-//! `cargo run --release -p isthmus --example floor_map [WIDTH_IN_METRES [FILE.png]]`
+//! `cargo run --release -p isthmus-shapes --example floor_map [WIDTH_IN_METRES [FILE.png]]`
 
 use image::{Rgb, RgbImage};
 use isthmus::isthmus::Polarity;
@@ -38,8 +38,8 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     let mut extractor = Extractor::default();
     for cutout in segment(&Frame::grey(COLUMNS, ROWS, &grid)?, &Parameters::default()).cutouts {
         let features = extractor.extract(&cutout)?;
-        for p in features.endoskeleton.branches.iter().flatten() {
-            mark(&mut picture, p.point, 0, Rgb([120, 160, 255]));
+        for pair in features.endoskeleton.branches.iter().flat_map(|branch| branch.windows(2)) {
+            line(&mut picture, [pair[0].point, pair[1].point], 0, Rgb([86, 140, 230]));
         }
         for passage in features.isthmuses.iter().filter(|i| i.polarity == Polarity::Positive) {
             let metres = passage.width * CELL;
@@ -50,15 +50,20 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
                 if passes { "passes" } else { "is stuck" }
             );
             let colour = if passes { Rgb([0, 114, 178]) } else { Rgb([213, 94, 0]) };
-            let [p, q] = passage.critical_points;
-            for k in 0..=200 {
-                mark(&mut picture, p + (q - p) * f64::from(k) / 200.0, 1, colour);
-            }
+            line(&mut picture, passage.critical_points, 1, colour);
         }
     }
     picture.save(&file)?;
     println!("{file}");
     Ok(())
+}
+
+/// Draws a straight line.
+fn line(picture: &mut RgbImage, [p, q]: [Point; 2], reach: i64, colour: Rgb<u8>) {
+    let steps = (f64::from(ZOOM) * (q - p).norm()).ceil().max(1.0);
+    for k in 0..=steps as u32 {
+        mark(picture, p + (q - p) * (f64::from(k) / steps), reach, colour);
+    }
 }
 
 /// Colours the square of picture pixels about a point of the grid.

@@ -1,6 +1,6 @@
 //! Least time from a grey frame in memory to all its features, in milliseconds, one line a picture: for comparisons with other programs.
 //!
-//! `cargo run --release -p isthmus --example time_frames -- PICTURE…`
+//! `cargo run --release -p isthmus-shapes --example time_frames -- PICTURE…`
 
 use isthmus::Extractor;
 use isthmus::mask::{Frame, Parameters, Segmenter};

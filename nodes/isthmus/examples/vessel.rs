@@ -1,6 +1,6 @@
 //! The narrowest places (stenoses) of a vessel silhouette: draws a branching vessel, finds its necks and writes a picture.
 //!
-//! `cargo run --release -p isthmus --example vessel [FILE.png]`
+//! `cargo run --release -p isthmus-shapes --example vessel [FILE.png]`
 
 use image::{Rgb, RgbImage};
 use isthmus::isthmus::Polarity;
@@ -41,23 +41,28 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     let mut extractor = Extractor::default();
     for cutout in segment(&Frame::grey(WIDTH, HEIGHT, &grey)?, &Parameters::default()).cutouts {
         let features = extractor.extract(&cutout)?;
-        for p in features.endoskeleton.branches.iter().flatten() {
-            mark(&mut picture, p.point, 0, Rgb([90, 160, 255]));
+        for pair in features.endoskeleton.branches.iter().flat_map(|branch| branch.windows(2)) {
+            line(&mut picture, [pair[0].point, pair[1].point], 0, Rgb([90, 160, 255]));
         }
         for neck in features.isthmuses.iter().filter(|i| i.polarity == Polarity::Positive) {
             println!(
                 "{:5.1} px wide at ({:.1}, {:.1}), widens by {:.1} px",
                 neck.width, neck.point.x, neck.point.y, neck.persistence
             );
-            let [p, q] = neck.critical_points;
-            for k in 0..=100 {
-                mark(&mut picture, p + (q - p) * f64::from(k) / 100.0, 1, Rgb([255, 140, 0]));
-            }
+            line(&mut picture, neck.critical_points, 1, Rgb([255, 140, 0]));
         }
     }
     picture.save(&file)?;
     println!("{file}");
     Ok(())
+}
+
+/// Draws a straight line.
+fn line(picture: &mut RgbImage, [p, q]: [Point; 2], reach: i64, colour: Rgb<u8>) {
+    let steps = ((q - p).norm()).ceil().max(1.0);
+    for k in 0..=steps as u32 {
+        mark(picture, p + (q - p) * (f64::from(k) / steps), reach, colour);
+    }
 }
 
 /// Colours the square of pixels about a point.

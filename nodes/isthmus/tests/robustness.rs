@@ -6,7 +6,7 @@ mod shapes;
 
 use isthmus::contour::{Border, ContourError};
 use isthmus::mask::{Aoi, Cutout, Frame, MaskError, Parameters, PixelFormat, Segmentation, segment};
-use isthmus::{Extractor, Features, Point};
+use isthmus::{Extractor, Features, Point, profile};
 use proptest::prelude::*;
 use rand::{RngExt, SeedableRng, rngs::StdRng};
 
@@ -29,6 +29,7 @@ fn finite(features: &Features) {
         assert!(numbers.iter().all(|v| v.is_finite()), "{i:?}");
         let length = features.border.length();
         assert!(i.arc.iter().all(|a| (0.0..length).contains(a)), "{i:?} on a border of {length}");
+        assert!(profile::distance_function(&features.border, i, 64).iter().all(|d| d.is_finite()), "{i:?}");
     }
     for s in features.endoskeleton.branches.iter().chain(&features.exoskeleton.branches).flatten() {
         assert!(s.point.x.is_finite() && s.point.y.is_finite() && s.distance.is_finite(), "{s:?}");
