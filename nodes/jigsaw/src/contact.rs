@@ -204,6 +204,8 @@ pub(crate) struct Contact {
     /// eliminated.
     pub(crate) hessian: Matrix3<f64>,
     pub(crate) gradient: Vector3<f64>,
+    /// How far apart the two borders run in this pose, in pixels.
+    pub(crate) clearance: f64,
 }
 
 /// Prior of a joint's clearance: mean and standard deviation, and the deviation of a border point, in pixels.
@@ -229,6 +231,7 @@ impl Equations {
     /// The contact after a small motion of `a` at the centre.
     fn contact(&self, motion: &Vector3<f64>, prior: &ClearancePrior) -> Contact {
         let (mut h, mut g) = (self.h, self.g + self.h.fixed_columns::<3>(0) * motion);
+        let clearance = self.clearance - g[3] / h[(3, 3)].max(f64::EPSILON);
         let pull = (prior.noise.max(self.spread) / prior.deviation.max(1e-3)).powi(2);
         h[(3, 3)] += pull;
         g[3] += pull * (self.clearance - prior.mean);
@@ -237,6 +240,7 @@ impl Equations {
             centre: self.centre,
             hessian: h.fixed_view::<3, 3>(0, 0).into_owned() - column * column.transpose() / h[(3, 3)],
             gradient: g.fixed_rows::<3>(0).into_owned() - column * (g[3] / h[(3, 3)]),
+            clearance,
         }
     }
 }

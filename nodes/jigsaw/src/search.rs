@@ -70,6 +70,15 @@ pub(crate) struct Joint {
     pub(crate) fit: placement::Fit,
 }
 
+/// A joint that is a mating.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Mated {
+    pub(crate) joint: usize,
+    pub(crate) confidence: f64,
+    /// How far apart the two borders run where the pieces lie, in pixels.
+    pub(crate) clearance: f64,
+}
+
 /// The poses found.
 #[derive(Debug, Clone, Default)]
 pub(crate) struct Outcome {
@@ -77,8 +86,8 @@ pub(crate) struct Outcome {
     pub(crate) poses: Vec<Option<(usize, Isometry2<f64>)>>,
     /// Loop support of each joint given.
     pub(crate) support: Vec<usize>,
-    /// Joints that are matings of the assembly, with their confidence.
-    pub(crate) matings: Vec<(usize, f64)>,
+    /// Matings of the assembly.
+    pub(crate) matings: Vec<Mated>,
     /// Confidence of each piece.
     pub(crate) confidence: Vec<f64>,
     pub(crate) backtracks: usize,
@@ -292,7 +301,7 @@ impl Assembler<'_> {
             let unsure: Vec<usize> = (0..self.outlines.len())
                 .filter(|k| outcome.poses[*k].is_some() && outcome.confidence[*k] < least)
                 .collect();
-            let weak: Vec<usize> = outcome.matings.iter().filter(|m| m.1 < least).map(|m| m.0).collect();
+            let weak: Vec<usize> = outcome.matings.iter().filter(|m| m.confidence < least).map(|m| m.joint).collect();
             let joined: Vec<usize> = weak.into_iter().filter(|k| self.holds(*k)).collect();
             if unsure.is_empty() && joined.is_empty() {
                 break;
@@ -300,7 +309,7 @@ impl Assembler<'_> {
             self.detach(&unsure, &joined);
             outcome = self.finish(joints);
         }
-        outcome.matings.retain(|m| m.1 >= least);
+        outcome.matings.retain(|m| m.confidence >= least);
         outcome
     }
 
@@ -1101,7 +1110,12 @@ impl Assembler<'_> {
             let [tab, mouth] = self.edges[k].slots();
             // The first contact of a piece confirms nothing beside itself.
             let least = (evidence[tab.piece].min(evidence[mouth.piece]) - AGREEMENT).max(0.0);
-            matings.push((k, sure(least)));
+            // All of the border where they lie says more than the segment by which they were matched.
+            let e = &self.edges[k];
+            let b_from_a = self.state.pose[e.b].inverse() * self.state.pose[e.a];
+            let contact = (!paper).then(|| self.contact_of(e.a, e.b, &b_from_a, FINE)).flatten();
+            let clearance = contact.map_or(joints[k].fit.clearance, |c| c.clearance);
+            matings.push(Mated { joint: k, confidence: sure(least), clearance });
         }
         let confidence: Vec<f64> = evidence.iter().map(|e| sure((e - AGREEMENT).max(0.0))).collect();
         Outcome {

@@ -5,7 +5,7 @@ use crate::correlation::correlate;
 use crate::index::{Entry, Hit, Index, Windows, shape_distance};
 use crate::outline::{Outline, Segment};
 use crate::paper;
-use crate::search::{self, Joint, Outcome};
+use crate::search::{self, Joint, Mated, Outcome};
 use crate::{Assembly, Mating, Params, ParamsError, Piece, Placement, Policy, TableCounts, Timings, frame, placement};
 use nalgebra::Isometry2;
 use rayon::prelude::*;
@@ -445,9 +445,9 @@ impl Solver {
         let outlines = ranked(&self.kept, order);
         let mut mated = vec![false; joints.len()];
         let mut taken = std::collections::HashSet::new();
-        for (k, _) in &outcome.matings {
-            mated[*k] = true;
-            let j = &joints[*k];
+        for Mated { joint, .. } in &outcome.matings {
+            mated[*joint] = true;
+            let j = &joints[*joint];
             taken.insert((true, j.a, j.tab));
             taken.insert((false, j.b, j.mouth));
         }
@@ -565,8 +565,8 @@ fn report(order: &[usize], outlines: &[&Outline], joints: &[Joint], outcome: &Ou
         }
     }
     assembly.unplaced = (0..order.len()).filter(|k| !placed[*k]).map(|k| order[k]).collect();
-    for (k, confidence) in &outcome.matings {
-        let j = &joints[*k];
+    for mated in &outcome.matings {
+        let j = &joints[mated.joint];
         let (tab, mouth) = (&outlines[j.a].tabs[j.tab], &outlines[j.b].mouths[j.mouth]);
         assembly.matings.push(Mating {
             positive_piece: order[j.a],
@@ -575,8 +575,8 @@ fn report(order: &[usize], outlines: &[&Outline], joints: &[Joint], outcome: &Ou
             negative_isthmus: mouth.isthmus,
             correlation: correlation_of(tab, mouth),
             ave_gap: j.fit.ave_gap,
-            clearance: j.fit.clearance,
-            confidence: *confidence,
+            clearance: mated.clearance,
+            confidence: mated.confidence,
         });
     }
     assembly
