@@ -18,7 +18,7 @@ export ROS_DOMAIN_ID=${ROS_DOMAIN_ID:-88} ROS_LOCALHOST_ONLY=1
 
 command -v cargo >/dev/null || { echo "demo: cargo is needed: see https://rustup.rs" >&2; exit 2; }
 cd "$root"
-echo "demo: building (some minutes the first time)"
+echo "demo: building (the first time ten minutes or more, on two cores)"
 cargo build --release --bins
 bin=$(realpath -m "${CARGO_TARGET_DIR:-target}")/release
 

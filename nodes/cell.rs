@@ -15,7 +15,7 @@ use crate::ros::process::{self, Process, ProcessError, Program, Work};
 use crate::ros::session::{CHANNEL_DEPTH, Session};
 use crate::{capture, feature, solver};
 
-/// Arguments of `jigsaw cell`.
+/// Run the three nodes in one process, joined by channels instead of DDS.
 #[derive(Debug, Clone, Default, clap::Args)]
 pub struct CellArgs {
     /// Folder of pictures to take instead of the topics of a camera.

@@ -108,12 +108,14 @@ fn strike(cell: &Cell, witness: &Witness, strike: &Strike) -> Duration {
     }
     let begun = Instant::now();
     for (&pid, node) in pids.iter().zip(&strike.nodes) {
-        // A node that has been stopped may have been lucky: none of its threads was waiting. Then it must still talk.
-        let deadline = begun + DEAF;
-        while runs(pid) && Instant::now() < deadline {
-            std::thread::sleep(cell::LOOK);
+        if strike.fault == Fault::Stopped {
+            // It may have been lucky: none of its threads was waiting. Then it must still talk.
+            while runs(pid) && begun.elapsed() < DEAF {
+                std::thread::sleep(cell::LOOK);
+            }
+        } else {
+            eventually(&format!("end of {node} after {strike:?}"), || (!runs(pid)).then_some(()));
         }
-        assert!(strike.fault == Fault::Stopped || !runs(pid), "{node} has outlived {strike:?}");
     }
     for node in &strike.nodes {
         let since = if strike.fault == Fault::Stopped { begun + DEAF } else { begun };

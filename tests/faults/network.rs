@@ -161,6 +161,7 @@ impl Spread {
         Self { _capture: capture, features, _solver: solver, witness, environment, truth }
     }
 
+    /// At a rate above 0 the camera waits for nobody: its first frames are lost unless it shows them again.
     fn play(&self, network: &Network, args: &[&str]) -> Running {
         let mut command = network.on(CAPTURE, &binaries().join("jigsaw"));
         command.args(["bag", "play"]).args(args).arg(bag24());
@@ -215,7 +216,7 @@ fn solve_without(lost: Signal, test: u8, orders: &[&str], is_static: bool) {
     let peers = [CAPTURE, FEATURE, SOLVER, HERE].map(|host| network.address(host).to_string()).join(";");
     let environment = if is_static { vec![("ROS_STATIC_PEERS", peers)] } else { Vec::new() };
     let spread = Spread::start(&network, &folder.0, domain(test.into()), &environment);
-    let _camera = spread.play(&network, &["--rate", "1"]);
+    let _camera = spread.play(&network, &["--loop", "--rate", "1"]);
     spread.shared();
     let pid = spread.features[1].pid("feature_node");
     assert!(signal(pid, lost));
@@ -261,7 +262,7 @@ fn a_link_that_is_cut_for_10_s() {
     let Some(mut network) = Network::new(6) else { return };
     let folder = Folder::new("network-6");
     let spread = Spread::start(&network, &folder.0, domain(6), &[]);
-    let _camera = spread.play(&network, &["--rate", "1"]);
+    let _camera = spread.play(&network, &["--loop", "--rate", "1"]);
     spread.shared();
     let feature = network.ports[FEATURE].clone();
     network.order(&format!("cut {feature}"));
