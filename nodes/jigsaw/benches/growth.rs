@@ -12,7 +12,6 @@ use anyhow::Context;
 use jigsaw::generate::{Options, Puzzle};
 use jigsaw::{Params, Piece, Solver};
 use plotters::prelude::*;
-use rayon::prelude::*;
 use std::path::{Path, PathBuf};
 use std::time::Instant;
 
@@ -25,13 +24,7 @@ fn shape(count: usize) -> (usize, usize) {
 fn pieces(count: usize) -> anyhow::Result<Vec<Piece>> {
     let (rows, columns) = shape(count);
     let puzzle = Puzzle::generate(&Options { rows, columns, seed: 1, frame: Some([512, 512]), ..Options::default() })?;
-    (0..puzzle.pieces().len())
-        .into_par_iter()
-        .map(|k| {
-            let features = isthmus::Features::from_border(puzzle.border(k, 1.0), 0.0)?;
-            Ok(Piece { id: puzzle.pieces()[k].id.clone(), features })
-        })
-        .collect()
+    Ok(puzzle.exact()?)
 }
 
 /// Processor time that all threads of this process have taken, in seconds.

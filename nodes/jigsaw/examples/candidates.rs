@@ -5,25 +5,9 @@
 //! `cargo run --release -p jigsaw --example candidates -- [--seeds FROM..TO]`
 
 use anyhow::Context;
-use isthmus::mask;
 use jigsaw::generate::{Options, Puzzle, SideKind};
-use jigsaw::{Params, Piece, Solver};
-use rayon::prelude::*;
+use jigsaw::{Params, Solver};
 use std::collections::{HashMap, HashSet};
-
-fn pieces(puzzle: &Puzzle) -> anyhow::Result<Vec<Piece>> {
-    (0..puzzle.frame_count())
-        .into_par_iter()
-        .map(|k| {
-            let frame = puzzle.render(k);
-            let frame = mask::Frame::grey(frame.width, frame.height, &frame.pixels)?;
-            let segmentation = mask::segment(&frame, &mask::Parameters::default());
-            let cutout = segmentation.cutouts.first().with_context(|| format!("frame {k} is empty"))?;
-            let features = isthmus::Extractor::default().extract(cutout).with_context(|| format!("frame {k}"))?;
-            Ok(Piece { id: puzzle.frame_stem(k), features })
-        })
-        .collect()
-}
 
 fn main() -> anyhow::Result<()> {
     let arguments: Vec<String> = std::env::args().skip(1).collect();
@@ -54,7 +38,7 @@ fn main() -> anyhow::Result<()> {
             let truth: HashSet<(usize, usize)> =
                 sides.values().filter(|s| s.len() == 2).map(|s| (s[0].min(s[1]), s[0].max(s[1]))).collect();
             let mut solver = Solver::new(Params::default())?;
-            for piece in pieces(&puzzle)? {
+            for piece in puzzle.seen()? {
                 solver.insert(piece)?;
             }
             solver.solve();

@@ -4,12 +4,11 @@
 //! where a case is one of those listed by `--list`, and a switch is one of loops, pose_graph, fit_clearance,
 //! recalibrate, merge_islands.
 
-use anyhow::{Context, bail};
-use isthmus::{Point, mask};
+use anyhow::Context;
+use isthmus::Point;
 use jigsaw::generate::{Cut, Options, Puzzle, Rim};
 use jigsaw::{Assembly, Fate, Params, Piece, Policy, Solver};
 use nalgebra::Vector2;
-use rayon::prelude::*;
 use std::time::Instant;
 
 /// A case: its name, how its puzzle is made, and whether its features come from rendered frames or from the outlines.
@@ -55,32 +54,6 @@ fn cases() -> Vec<Case> {
         exact("exact25x40", small(25, 40)),
         exact("exact100x100", small(100, 100)),
     ]
-}
-
-/// Pieces from rendered frames (or straight from the outlines).
-fn pieces(puzzle: &Puzzle, frames: bool) -> anyhow::Result<Vec<Piece>> {
-    if !frames {
-        return (0..puzzle.pieces().len())
-            .into_par_iter()
-            .map(|k| {
-                let features = isthmus::Features::from_border(puzzle.border(k, 1.0), 0.0)?;
-                Ok(Piece { id: puzzle.pieces()[k].id.clone(), features })
-            })
-            .collect();
-    }
-    (0..puzzle.frame_count())
-        .into_par_iter()
-        .map(|k| {
-            let frame = puzzle.render(k);
-            let frame = mask::Frame::grey(frame.width, frame.height, &frame.pixels)?;
-            let segmentation = mask::segment(&frame, &mask::Parameters::default());
-            let [cutout] = &segmentation.cutouts[..] else {
-                bail!("{} shapes in frame {k}", segmentation.cutouts.len())
-            };
-            let features = isthmus::Extractor::default().extract(cutout).with_context(|| format!("frame {k}"))?;
-            Ok(Piece { id: puzzle.frame_stem(k), features })
-        })
-        .collect()
 }
 
 /// Lower bounds of the classes in which confidences are counted.
@@ -170,7 +143,7 @@ fn main() -> anyhow::Result<()> {
         for seed in seeds.clone() {
             let puzzle = Puzzle::generate(&Options { seed, ..case.options.clone() })?;
             let begin = Instant::now();
-            let pieces = pieces(&puzzle, case.frames)?;
+            let pieces = if case.frames { puzzle.seen()? } else { puzzle.exact()? };
             let features = begin.elapsed().as_secs_f64();
             let mut solver = Solver::new(params)?;
             for piece in &pieces {

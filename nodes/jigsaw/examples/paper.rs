@@ -6,11 +6,9 @@
 //! Writes `README.md` and pictures (SVG) to the folder. Nothing is picked by hand: the puzzle shown is the first of the
 //! seeds whose greedy descent goes wrong and is mended by backtracking.
 
-use anyhow::{Context, bail};
-use isthmus::mask;
+use anyhow::{Context};
 use jigsaw::generate::{Options, Puzzle, Score};
 use jigsaw::{Assembly, Params, Piece, Policy, Solver, TableCounts};
-use rayon::prelude::*;
 use std::fmt::Write;
 use std::path::{Path, PathBuf};
 
@@ -35,19 +33,7 @@ fn params() -> [Params; 3] {
 
 fn trial(options: &Options) -> anyhow::Result<Trial> {
     let puzzle = Puzzle::generate(options)?;
-    let pieces: Vec<Piece> = (0..puzzle.frame_count())
-        .into_par_iter()
-        .map(|k| {
-            let frame = puzzle.render(k);
-            let frame = mask::Frame::grey(frame.width, frame.height, &frame.pixels)?;
-            let segmentation = mask::segment(&frame, &mask::Parameters::default());
-            let [cutout] = &segmentation.cutouts[..] else {
-                bail!("{} shapes in frame {k}", segmentation.cutouts.len())
-            };
-            let features = isthmus::Extractor::default().extract(cutout).with_context(|| format!("frame {k}"))?;
-            Ok(Piece { id: puzzle.frame_stem(k), features })
-        })
-        .collect::<Result<_, _>>()?;
+    let pieces = puzzle.seen()?;
     let mut runs = Vec::new();
     for params in params() {
         let mut solver = Solver::new(params)?;
@@ -58,7 +44,7 @@ fn trial(options: &Options) -> anyhow::Result<Trial> {
         let score = puzzle.score(&pieces, &assembly);
         runs.push((assembly, score));
     }
-    let Ok(runs) = runs.try_into() else { bail!("three policies") };
+    let runs = runs.try_into().map_err(|_| anyhow::anyhow!("a run for each of three policies"))?;
     Ok(Trial { seed: options.seed, puzzle, pieces, runs })
 }
 

@@ -81,12 +81,6 @@ fn coincide(a: &Outline, b: &Outline, b_from_a: &Isometry2<f64>) -> bool {
     const FEW: usize = 50;
     let tolerance = sameness(a, b);
     let stride = (a.points.len() / OVERLAY_SAMPLES).max(1);
-    let off = a.points.iter().step_by(stride).filter(|p| {
-        let p = b_from_a * **p;
-        b.raster.cell_of(p).is_none_or(|cell| {
-            let (i, other, part) = b.foot(p, b.raster.nearest[cell] as usize);
-            (p - (b.points[i] + (b.points[other] - b.points[i]) * part)).norm() > tolerance
-        })
-    });
+    let off = a.points.iter().step_by(stride).filter(|p| b.gap(b_from_a * **p, tolerance).is_none());
     off.count() * FEW <= a.points.len().div_ceil(stride)
 }

@@ -19,7 +19,7 @@
 
 use crate::outline::Outline;
 use crate::placement::laid_on;
-use crate::posegraph::lever;
+use crate::posegraph::{lever, turned};
 use isthmus::Point;
 use nalgebra::{Isometry2, Matrix3, Vector2, Vector3};
 
@@ -131,9 +131,7 @@ fn step(e: &Edge, from: usize, pose: &Isometry2<f64>, reference: Point) -> (Isom
         let a_from_b = e.b_from_a.inverse();
         (a_from_b, pose.rotation * a_from_b.rotation, a_from_b * e.at)
     };
-    let mut turn = Matrix3::identity();
-    turn.fixed_view_mut::<2, 2>(0, 0).copy_from(rotation.to_rotation_matrix().matrix());
-    let motion = lever(pose * at, reference) * turn;
+    let motion = lever(pose * at, reference) * turned(rotation);
     (pose * step, motion * e.covariance * motion.transpose())
 }
 

@@ -5,7 +5,7 @@
 //! contacts is minimised by one sparse Cholesky factorisation in 3 x 3 blocks, nodes eliminated by least degree (fill
 //! O(n log n) on the planar graph of a puzzle). The first node of each connected part stays where it is.
 
-use nalgebra::{Matrix3, Point2, Vector3};
+use nalgebra::{Matrix3, Point2, UnitComplex, Vector3};
 use std::cmp::Reverse;
 use std::collections::BinaryHeap;
 
@@ -23,6 +23,11 @@ pub(crate) struct Factor {
 pub(crate) fn lever(from: Point2<f64>, to: Point2<f64>) -> Matrix3<f64> {
     let d = to - from;
     Matrix3::new(1.0, 0.0, -d.y, 0.0, 1.0, d.x, 0.0, 0.0, 1.0)
+}
+
+/// A turn of the axes in which a small motion (x, y, turn) is given.
+pub(crate) fn turned(rotation: UnitComplex<f64>) -> Matrix3<f64> {
+    rotation.to_rotation_matrix().to_homogeneous()
 }
 
 /// Motions (x, y, turn about the reference point) of all nodes that minimise the sum of the factors.

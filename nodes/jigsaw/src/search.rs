@@ -18,7 +18,7 @@ use crate::contact::{ClearancePrior, Contact, Memory};
 use crate::copies::copies;
 use crate::loops::{self, Closure, Edge, Said, Slot, Tolerance, conflict, difference};
 use crate::outline::Outline;
-use crate::posegraph::{Factor, minimise};
+use crate::posegraph::{Factor, minimise, turned};
 use crate::solver::Budget;
 use crate::{Params, Policy, placement};
 use nalgebra::{Isometry2, Matrix3, Point2, Translation2, UnitComplex, Vector2, Vector3};
@@ -733,18 +733,8 @@ impl Assembler<'_> {
         let factors: Vec<Factor> = pairs
             .par_iter()
             .filter_map(|&(p, q)| {
-                let c = self.contact_of(p, q, &(self.state.pose[q].inverse() * self.state.pose[p]), step)?;
-                let pose = self.state.pose[q];
-                let r = pose.rotation.to_rotation_matrix();
-                let mut turn = Matrix3::identity();
-                turn.fixed_view_mut::<2, 2>(0, 0).copy_from(r.matrix());
-                Some(Factor {
-                    a: place[&p],
-                    b: place[&q],
-                    centre: pose * c.centre,
-                    hessian: turn * c.hessian * turn.transpose(),
-                    gradient: turn * c.gradient,
-                })
+                let poses = [self.state.pose[p], self.state.pose[q]];
+                self.factor((p, place[&p]), (q, place[&q]), &poses, step)
             })
             .collect();
         let motion = minimise(&references, &factors);
@@ -757,6 +747,20 @@ impl Assembler<'_> {
             let about = Translation2::from(centre + shift) * turn * Translation2::from(-centre);
             self.state.pose[k] = about * self.state.pose[k];
         }
+    }
+
+    /// What the contact of two pieces says about the motion of their nodes, given their poses in one island.
+    fn factor(
+        &self,
+        (p, a): (usize, usize),
+        (q, b): (usize, usize),
+        poses: &[Isometry2<f64>; 2],
+        step: f64,
+    ) -> Option<Factor> {
+        let c = self.contact_of(p, q, &(poses[1].inverse() * poses[0]), step)?;
+        let turn = turned(poses[1].rotation);
+        let (hessian, gradient) = (turn * c.hessian * turn.transpose(), turn * c.gradient);
+        Some(Factor { a, b, centre: poses[1] * c.centre, hessian, gradient })
     }
 
     fn contact_of(&self, p: usize, q: usize, q_from_p: &Isometry2<f64>, step: f64) -> Option<Contact> {

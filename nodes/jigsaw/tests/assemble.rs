@@ -6,18 +6,9 @@ use jigsaw::{Assembly, Params, Piece, Policy, Solver};
 /// Worst piece of a 4 x 6 puzzle from exact outlines, in pixels: the border is sampled at 1 px.
 const EXACT_OFFSET: f64 = 0.06;
 
-fn exact_pieces(puzzle: &Puzzle) -> Vec<Piece> {
-    (0..puzzle.pieces().len())
-        .map(|k| Piece {
-            id: puzzle.pieces()[k].id.clone(),
-            features: isthmus::Features::from_border(puzzle.border(k, 1.0), 0.0).expect("features of a true outline"),
-        })
-        .collect()
-}
-
 fn solve(options: &Options, params: &Params) -> (Score, Assembly) {
     let puzzle = Puzzle::generate(options).expect("valid options");
-    let pieces = exact_pieces(&puzzle);
+    let pieces = puzzle.exact().expect("features of true outlines");
     let assembly = jigsaw::assemble(&pieces, params).expect("valid pieces");
     (puzzle.score(&pieces, &assembly), assembly)
 }
@@ -102,7 +93,7 @@ fn backtracking_mends_what_the_greedy_descent_spoils() {
 #[test]
 fn order_of_insertion_and_threads_do_not_matter() {
     let puzzle = Puzzle::generate(&Options { seed: 21, ..Options::default() }).expect("valid options");
-    let pieces = exact_pieces(&puzzle);
+    let pieces = puzzle.exact().expect("features of true outlines");
     let run = |pieces: &[Piece], threads: usize| {
         let mut solver = Solver::new(Params { threads, ..Params::default() }).expect("valid parameters");
         for piece in pieces {
@@ -127,7 +118,7 @@ fn order_of_insertion_and_threads_do_not_matter() {
 #[test]
 fn pieces_that_come_one_by_one_make_the_same_assembly() {
     let puzzle = Puzzle::generate(&Options { rows: 3, columns: 4, seed: 5, ..Options::default() }).expect("valid");
-    let pieces = exact_pieces(&puzzle);
+    let pieces = puzzle.exact().expect("features of true outlines");
     let mut solver = Solver::new(Params::default()).expect("valid parameters");
     let mut last = Assembly::default();
     for piece in &pieces {
@@ -156,7 +147,7 @@ fn bad_input_is_refused_by_name() {
     assert!(error.contains("candidates=0"), "{error}");
 
     let puzzle = Puzzle::generate(&Options { rows: 2, columns: 2, ..Options::default() }).expect("valid");
-    let pieces = exact_pieces(&puzzle);
+    let pieces = puzzle.exact().expect("features of true outlines");
     let mut solver = Solver::new(Params::default()).expect("valid parameters");
     solver.insert(pieces[0].clone()).expect("first");
     let error = solver.insert(pieces[0].clone()).expect_err("twice").to_string();
@@ -174,7 +165,7 @@ fn confidence_means_what_it_says() {
     let (mut right, mut all) = (0, 0);
     for (seed, similarity) in [(1, 0.9), (2, 0.98), (3, 0.99), (4, 0.995), (5, 0.999)] {
         let puzzle = Puzzle::generate(&Options { seed, similarity, ..Options::default() }).expect("valid options");
-        let pieces = exact_pieces(&puzzle);
+        let pieces = puzzle.exact().expect("features of true outlines");
         let mut assembly = jigsaw::assemble(&pieces, &Params::default()).expect("valid pieces");
         assembly.matings.retain(|m| m.confidence >= SURE);
         right += puzzle.score(&pieces, &assembly).right_matings;

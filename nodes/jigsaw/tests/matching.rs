@@ -7,12 +7,7 @@ use std::sync::atomic::{AtomicUsize, Ordering};
 
 fn pieces(options: &Options) -> Vec<Piece> {
     let puzzle = Puzzle::generate(options).expect("valid options");
-    (0..puzzle.pieces().len())
-        .map(|k| Piece {
-            id: puzzle.pieces()[k].id.clone(),
-            features: isthmus::Features::from_border(puzzle.border(k, 1.0), 0.0).expect("features of a true outline"),
-        })
-        .collect()
+    puzzle.exact().expect("features of true outlines")
 }
 
 fn solver(pieces: &[Piece], params: Params) -> Solver {

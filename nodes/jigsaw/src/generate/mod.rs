@@ -27,6 +27,7 @@
 //! ```
 
 mod cut;
+mod observe;
 mod render;
 mod truth;
 
@@ -40,6 +41,7 @@ use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::SeedableRng;
 
 use cut::Sheet;
+pub use observe::ObserveError;
 pub use render::Frame;
 pub use truth::{FrameLabel, JointTruth, PieceTruth, PoseTruth, Score, SideTruth, Truth};
 

@@ -15,7 +15,7 @@
 use super::{ACCEPT, Assembler, COARSE, Model, spread_of};
 use crate::posegraph::{Factor, minimise};
 use isthmus::Point;
-use nalgebra::{Isometry2, Matrix3, Translation2, UnitComplex};
+use nalgebra::{Isometry2, Translation2, UnitComplex};
 use rayon::prelude::*;
 
 /// Border farther than this from any other, in piece scales, lies open and says nothing.
@@ -158,15 +158,8 @@ impl Assembler<'_> {
             let factors: Vec<Factor> = self
                 .around(piece, island, &settled)
                 .into_iter()
-                .filter_map(|q| {
-                    let other = self.state.pose[q];
-                    let c = self.contact_of(piece, q, &(other.inverse() * settled), COARSE)?;
-                    let mut turn = Matrix3::identity();
-                    turn.fixed_view_mut::<2, 2>(0, 0).copy_from(other.rotation.to_rotation_matrix().matrix());
-                    let (hessian, gradient) = (turn * c.hessian * turn.transpose(), turn * c.gradient);
-                    // The island is the first node, which stays where it is.
-                    Some(Factor { a: 1, b: 0, centre: other * c.centre, hessian, gradient })
-                })
+                // The island is the first node, which stays where it is.
+                .filter_map(|q| self.factor((piece, 1), (q, 0), &[settled, self.state.pose[q]], COARSE))
                 .collect();
             if factors.is_empty() {
                 return settled;
