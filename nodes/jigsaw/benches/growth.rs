@@ -1,6 +1,6 @@
 //! How the cost of a solution grows with the number of pieces.
 //!
-//! `cargo bench -p jigsaw --bench growth -- [COUNT…] [--plot FILE.svg]`
+//! `cargo bench -p jigsaw --bench growth -- [COUNT…] [--plot FILE.svg]` (the file is taken from the folder of the crate)
 //!
 //! Features are made from true outlines, so that only matching and assembly are timed. Each row gives the best of a few
 //! runs in milliseconds (matching, assembly), the processor time of both on all threads, the exponent with which it has
