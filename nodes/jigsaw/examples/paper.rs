@@ -6,7 +6,7 @@
 //! Writes `README.md` and pictures (SVG) to the folder. Nothing is picked by hand: the puzzle shown is the first of the
 //! seeds whose greedy descent goes wrong and is mended by backtracking.
 
-use anyhow::{Context};
+use anyhow::Context;
 use jigsaw::generate::{Options, Puzzle, Score};
 use jigsaw::{Assembly, Params, Piece, Policy, Solver, TableCounts};
 use std::fmt::Write;
