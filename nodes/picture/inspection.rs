@@ -64,7 +64,7 @@ pub fn inspection(id: &str, source: &str, cutout: &Cutout, features: &Features, 
     let plot_rows = plots.div_ceil(PLOT_COLUMNS) as f64;
     let plot_columns = plots.min(PLOT_COLUMNS) as f64;
 
-    let header = 3.0 * Size::Normal.height() + 24.0;
+    let header = 4.0 * Size::Normal.height() + 32.0;
     let legend = 4.0 * (Size::Normal.height() + 6.0);
     let panel = (columns * scale, (rows * scale).max(plot_rows * PLOT.1));
     let width = (panel.0 + plot_columns * (PLOT.0 + MARGIN)).max(860.0) + 2.0 * MARGIN;
@@ -93,7 +93,16 @@ pub fn inspection(id: &str, source: &str, cutout: &Cutout, features: &Features, 
         count(waists, "shallow waist")
     );
     canvas.text(Point::new(MARGIN, MARGIN + 30.0), &facts, Size::Normal, false, INK);
-    canvas.text(Point::new(MARGIN, MARGIN + 54.0), &counts, Size::Normal, false, INK);
+    let decided = format!(
+        "grey levels: piece {:.0}, ground {:.0}, border {:.0}, noise {:.1}; border sampled every {:.2} px",
+        cutout.shape_level,
+        cutout.ground_level,
+        0.5 * (cutout.shape_level + cutout.ground_level),
+        cutout.noise_level,
+        features.border.spacing,
+    );
+    canvas.text(Point::new(MARGIN, MARGIN + 54.0), &decided, Size::Normal, false, INK);
+    canvas.text(Point::new(MARGIN, MARGIN + 78.0), &counts, Size::Normal, false, INK);
 
     let top_left = Point::new(MARGIN, header + MARGIN);
     let picture_from_frame = View { origin: corner(window), scale, top_left };
