@@ -425,7 +425,7 @@ impl Closure {
         const STEPS: usize = 12;
         const SETTLED: f64 = 1e-3;
         /// Loops that are looked at: more don't make the scales surer.
-        const LOOPS: usize = 200;
+        const LOOPS: usize = 150;
         let sets = if decoys.sets > 0.0 { decoys.sets } else { 1.0 };
         let mut closed = decoys.distances.clone();
         closed.push(guess.wide);

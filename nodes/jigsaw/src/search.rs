@@ -386,8 +386,9 @@ impl Assembler<'_> {
     fn close_loops(&mut self, joints: &[Joint]) -> Vec<loops::Loop> {
         self.closure = self.first_guess();
         if self.params.recalibrate {
-            let mut first = self.ways(FIRST_RANKS).close();
-            self.weigh(&mut first, FIRST_RANKS);
+            let ways = self.ways(FIRST_RANKS);
+            let mut first = ways.close();
+            self.closure = self.weigh(&ways, &mut first);
             let sure = first.iter().filter(|l| l.evidence >= FOUND);
             let mut supported: Vec<usize> = sure.flat_map(|l| l.edges.iter().copied()).collect();
             supported.sort_unstable();
@@ -397,14 +398,13 @@ impl Assembler<'_> {
             self.learn(&supported);
         }
         // The fewer candidates take part, the fewer loops close by chance: those of the best ones say more.
-        let mut found = self.ways(LOOP_RANKS).close();
-        for ranks in [FIRST_RANKS, LOOP_RANKS] {
-            let among = |l: &loops::Loop| l.edges.iter().all(|k| self.among(*k, ranks));
-            let (mut these, others): (Vec<loops::Loop>, Vec<loops::Loop>) = found.into_iter().partition(among);
-            self.weigh(&mut these, ranks);
-            these.extend(others);
-            found = these;
-        }
+        let all = self.ways(LOOP_RANKS);
+        let among = |l: &loops::Loop| l.edges.iter().all(|k| self.among(*k, FIRST_RANKS));
+        let (mut best, others): (Vec<loops::Loop>, Vec<loops::Loop>) = all.close().into_iter().partition(among);
+        self.weigh(&self.ways(FIRST_RANKS), &mut best);
+        let mut found = best;
+        found.extend(others);
+        self.closure = self.weigh(&all, &mut found);
         self.sorted(found)
     }
 
@@ -419,14 +419,14 @@ impl Assembler<'_> {
         loops::Ways::new(&self.edges, &active, self.outlines, LOOSE)
     }
 
-    /// Learns how loops of the best candidates close, and those of decoys, and gives each the evidence that follows,
-    /// unless it has more already.
-    fn weigh(&mut self, found: &mut [loops::Loop], ranks: usize) {
-        let decoys = self.ways(ranks).close_decoys();
-        self.closure = Closure::fit(&self.first_guess(), found, &decoys);
+    /// How the loops along some ways close, beside those of decoys; gives each loop the evidence that follows, unless it
+    /// has more already.
+    fn weigh(&self, ways: &loops::Ways, found: &mut [loops::Loop]) -> Closure {
+        let closure = Closure::fit(&self.first_guess(), found, &ways.close_decoys());
         for l in found {
-            l.evidence = l.evidence.max(self.closure.evidence(l.distance));
+            l.evidence = l.evidence.max(closure.evidence(l.distance));
         }
+        closure
     }
 
     /// How loops should close, by the residuals of the best candidates and the tolerance of the search.

@@ -565,10 +565,10 @@ fn report(order: &[usize], outlines: &[&Outline], joints: &[Joint], outcome: &Ou
         }
     }
     assembly.unplaced = (0..order.len()).filter(|k| !placed[*k]).map(|k| order[k]).collect();
-    for mated in &outcome.matings {
+    let mating = |mated: &Mated| {
         let j = &joints[mated.joint];
         let (tab, mouth) = (&outlines[j.a].tabs[j.tab], &outlines[j.b].mouths[j.mouth]);
-        assembly.matings.push(Mating {
+        Mating {
             positive_piece: order[j.a],
             positive_isthmus: tab.isthmus,
             negative_piece: order[j.b],
@@ -577,8 +577,9 @@ fn report(order: &[usize], outlines: &[&Outline], joints: &[Joint], outcome: &Ou
             ave_gap: j.fit.ave_gap,
             clearance: mated.clearance,
             confidence: mated.confidence,
-        });
-    }
+        }
+    };
+    assembly.matings = outcome.matings.par_iter().map(mating).collect();
     assembly
 }
 
