@@ -36,6 +36,8 @@ def generate_launch_description():
             remappings=remappings or [],
             respawn=True,
             respawn_delay=0.5,
+            # A node that has reached its limit of memory must end, not ask for more to tell where it was.
+            additional_env={"RUST_BACKTRACE": "0"},
             output="screen",
         )
 

@@ -16,6 +16,7 @@ use isthmus::skeleton::Triangulation;
 use isthmus::{Extractor, profile};
 use shapes::{Camera, Piece, pose};
 use std::hint::black_box;
+use std::sync::atomic::{AtomicUsize, Ordering};
 
 /// Samples of an isthmus distance function.
 const IDF: usize = 64;
@@ -86,6 +87,25 @@ fn many_pieces(c: &mut Criterion) {
             let found = segmenter.segment(black_box(&frame), &Parameters::default());
             assert_eq!(found.cutouts.len(), 30);
             found.cutouts.iter().map(|c| extractor.extract(c).unwrap().isthmuses.len()).sum::<usize>()
+        });
+    });
+    let mut extractors = [Extractor::default(), Extractor::default()];
+    group.bench_function("all of it, pieces on two threads", |b| {
+        b.iter(|| {
+            let found = segmenter.segment(black_box(&frame), &Parameters::default());
+            let next = AtomicUsize::new(0);
+            let work = |extractor: &mut Extractor| {
+                let mut isthmuses = 0;
+                while let Some(cutout) = found.cutouts.get(next.fetch_add(1, Ordering::Relaxed)) {
+                    isthmuses += extractor.extract(cutout).unwrap().isthmuses.len();
+                }
+                isthmuses
+            };
+            let [first, second] = &mut extractors;
+            std::thread::scope(|scope| {
+                let other = scope.spawn(|| work(first));
+                work(second) + other.join().unwrap()
+            })
         });
     });
     group.finish();
