@@ -6,7 +6,7 @@
 //! are left (half or quarter), the one that turns the first piece least. Top left of the bounding box at the origin;
 //! further assemblies stand to the right of it, a piece's width apart.
 
-use crate::outline::Outline;
+use crate::outline::{Outline, convex_hull};
 use isthmus::Point;
 use nalgebra::{Isometry2, Translation2, UnitComplex, Vector2};
 use std::f64::consts::{FRAC_PI_2, PI};
@@ -95,56 +95,6 @@ fn straight_direction(edges: &[Vector2<f64>], perimeter: f64) -> Option<f64> {
     let (rough, _) = mean(None);
     let (angle, length) = mean(Some(rough));
     (length > 0.0 && length >= STRAIGHT_SHARE * 0.5 * perimeter).then_some(angle)
-}
-
-/// Drops points that can't be on the hull: those inside the octagon of the extreme points in eight directions (Akl and
-/// Toussaint 1978), mostly nine in ten.
-fn drop_inner(points: &mut Vec<Point>) {
-    const DIRECTIONS: [(f64, f64); 8] =
-        [(1.0, 0.0), (1.0, 1.0), (0.0, 1.0), (-1.0, 1.0), (-1.0, 0.0), (-1.0, -1.0), (0.0, -1.0), (1.0, -1.0)];
-    let Some(first) = points.first() else { return };
-    let mut extreme = DIRECTIONS.map(|_| (f64::NEG_INFINITY, *first));
-    for p in points.iter() {
-        for (best, (x, y)) in extreme.iter_mut().zip(DIRECTIONS) {
-            let far = x * p.x + y * p.y;
-            if far > best.0 {
-                *best = (far, *p);
-            }
-        }
-    }
-    // Each side as a line `normal . p + offset`, positive inside; sides of no length exclude nothing.
-    let sides = std::array::from_fn::<_, 8, _>(|k| {
-        let (a, b) = (extreme[k].1, extreme[(k + 1) % 8].1);
-        let (nx, ny) = (a.y - b.y, b.x - a.x);
-        (nx, ny, -(nx * a.x + ny * a.y))
-    });
-    points.retain(|p| {
-        sides.iter().any(|(nx, ny, offset)| nx * p.x + ny * p.y + offset <= 0.0 && (*nx, *ny) != (0.0, 0.0))
-    });
-}
-
-/// Convex hull (Andrew 1979), running so that the turn is never negative.
-pub(crate) fn convex_hull(mut points: Vec<Point>) -> Vec<Point> {
-    drop_inner(&mut points);
-    points.sort_by(|p, q| p.x.total_cmp(&q.x).then(p.y.total_cmp(&q.y)));
-    let half = |points: &mut dyn Iterator<Item = Point>| {
-        let mut hull: Vec<Point> = Vec::new();
-        for p in points {
-            while hull.len() > 1 {
-                let (a, b) = (hull[hull.len() - 2], hull[hull.len() - 1]);
-                if (b - a).perp(&(p - a)) > 0.0 {
-                    break;
-                }
-                hull.pop();
-            }
-            hull.push(p);
-        }
-        hull.pop();
-        hull
-    };
-    let mut hull = half(&mut points.iter().copied());
-    hull.extend(half(&mut points.iter().rev().copied()));
-    hull
 }
 
 /// Direction of one side of the rectangle of least area about a convex polygon.

@@ -20,8 +20,8 @@ mod posegraph;
 mod search;
 pub mod solver;
 
-pub use params::{Params, ParamsError, Policy};
-pub use solver::{Budget, Candidate, Fate, Posed, Rule, Solver, SolverError, assemble};
+pub use params::{Budget, Params, ParamsError, Policy};
+pub use solver::{Candidate, Fate, Posed, Rule, Solver, SolverError, assemble};
 
 /// A piece as the solver knows it.
 #[derive(Debug, Clone, PartialEq)]

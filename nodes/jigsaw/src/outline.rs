@@ -4,7 +4,6 @@
 //! Coordinates are pixels of the piece's image (x right, y down) unless said otherwise.
 
 use crate::Piece;
-use crate::frame::convex_hull;
 use isthmus::Point;
 use isthmus::isthmus::{Isthmus, Polarity};
 use nalgebra::Vector2;
@@ -373,6 +372,56 @@ fn keys(shape: &[f32; SHAPE_SAMPLES]) -> [f32; KEYS] {
         let sum: f32 = shape.iter().enumerate().map(|(i, v)| v * (w * (i as f32 + 0.5)).cos()).sum();
         sum * (2.0f32).sqrt() / n
     })
+}
+
+/// Drops points that can't be on the hull: those inside the octagon of the extreme points in eight directions (Akl and
+/// Toussaint 1978), mostly nine in ten.
+fn drop_inner(points: &mut Vec<Point>) {
+    const DIRECTIONS: [(f64, f64); 8] =
+        [(1.0, 0.0), (1.0, 1.0), (0.0, 1.0), (-1.0, 1.0), (-1.0, 0.0), (-1.0, -1.0), (0.0, -1.0), (1.0, -1.0)];
+    let Some(first) = points.first() else { return };
+    let mut extreme = DIRECTIONS.map(|_| (f64::NEG_INFINITY, *first));
+    for p in points.iter() {
+        for (best, (x, y)) in extreme.iter_mut().zip(DIRECTIONS) {
+            let far = x * p.x + y * p.y;
+            if far > best.0 {
+                *best = (far, *p);
+            }
+        }
+    }
+    // Each side as a line `normal . p + offset`, positive inside; sides of no length exclude nothing.
+    let sides = std::array::from_fn::<_, 8, _>(|k| {
+        let (a, b) = (extreme[k].1, extreme[(k + 1) % 8].1);
+        let (nx, ny) = (a.y - b.y, b.x - a.x);
+        (nx, ny, -(nx * a.x + ny * a.y))
+    });
+    points.retain(|p| {
+        sides.iter().any(|(nx, ny, offset)| nx * p.x + ny * p.y + offset <= 0.0 && (*nx, *ny) != (0.0, 0.0))
+    });
+}
+
+/// Convex hull (Andrew 1979), running so that the turn is never negative.
+pub(crate) fn convex_hull(mut points: Vec<Point>) -> Vec<Point> {
+    drop_inner(&mut points);
+    points.sort_by(|p, q| p.x.total_cmp(&q.x).then(p.y.total_cmp(&q.y)));
+    let half = |points: &mut dyn Iterator<Item = Point>| {
+        let mut hull: Vec<Point> = Vec::new();
+        for p in points {
+            while hull.len() > 1 {
+                let (a, b) = (hull[hull.len() - 2], hull[hull.len() - 1]);
+                if (b - a).perp(&(p - a)) > 0.0 {
+                    break;
+                }
+                hull.pop();
+            }
+            hull.push(p);
+        }
+        hull.pop();
+        hull
+    };
+    let mut hull = half(&mut points.iter().copied());
+    hull.extend(half(&mut points.iter().rev().copied()));
+    hull
 }
 
 impl Raster {

@@ -12,8 +12,7 @@
 
 use crate::correlation::correlate;
 use crate::outline::{Outline, Segment};
-use crate::placement::{Fit, rigid_fit};
-use crate::search::Joint;
+use crate::placement::{Fit, Joint, rigid_fit};
 use crate::{Rule, TableCounts};
 use isthmus::Point;
 use nalgebra::{Isometry2, Matrix3};

@@ -1,6 +1,7 @@
-//! What the user may choose.
+//! What the user may choose, and how long a solution may take.
 
 use serde::{Deserialize, Serialize};
+use std::time::Instant;
 use thiserror::Error;
 
 /// Which rules decide.
@@ -126,5 +127,24 @@ impl Params {
             return Err(ParamsError::Threads(self.threads));
         }
         Ok(())
+    }
+}
+
+/// When a solution has to come to an end. [`Solver::solve`](crate::Solver::solve) measures the time against [`Params::time_budget`]; another
+/// measure can be given to [`Solver::solve_within`](crate::Solver::solve_within).
+pub trait Budget: Sync {
+    /// The part that is used up; from 1 on the best assembly so far is taken.
+    fn spent(&self) -> f64;
+}
+
+/// Wall-clock time; without a limit it never runs out.
+pub(crate) struct Time {
+    pub(crate) begin: Instant,
+    pub(crate) seconds: f64,
+}
+
+impl Budget for Time {
+    fn spent(&self) -> f64 {
+        if self.seconds > 0.0 { self.begin.elapsed().as_secs_f64() / self.seconds } else { 0.0 }
     }
 }

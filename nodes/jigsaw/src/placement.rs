@@ -58,6 +58,16 @@ pub(crate) struct Fit {
     pub(crate) information: Matrix3<f64>,
 }
 
+/// A candidate given to the assembly: tab `tab` of piece `a` in mouth `mouth` of piece `b`.
+#[derive(Debug, Clone)]
+pub(crate) struct Joint {
+    pub(crate) a: usize,
+    pub(crate) tab: usize,
+    pub(crate) b: usize,
+    pub(crate) mouth: usize,
+    pub(crate) fit: Fit,
+}
+
 /// A pose during refinement: tab's local frame to mouth's local frame.
 #[derive(Debug, Clone, Copy, PartialEq)]
 struct Pose {

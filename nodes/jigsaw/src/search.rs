@@ -18,8 +18,9 @@ use crate::contact::{ClearancePrior, Contact, Memory};
 use crate::copies::copies;
 use crate::loops::{self, Closure, Edge, Said, Slot, Tolerance, conflict, difference};
 use crate::outline::Outline;
+use crate::params::Budget;
+use crate::placement::Joint;
 use crate::posegraph::{Factor, minimise, turned};
-use crate::solver::Budget;
 use crate::{Params, Policy, placement};
 use nalgebra::{Isometry2, Matrix3, Point2, Translation2, UnitComplex, Vector2, Vector3};
 use state::{Slots, State};
@@ -59,16 +60,6 @@ const GROWTH_RANKS: usize = 12;
 const REGROWTHS: usize = 3;
 /// Contact of outlines is looked for within this distance, in piece scales.
 const CONTACT_BAND: f64 = 0.035;
-
-/// A candidate given to the assembly.
-#[derive(Debug, Clone)]
-pub(crate) struct Joint {
-    pub(crate) a: usize,
-    pub(crate) tab: usize,
-    pub(crate) b: usize,
-    pub(crate) mouth: usize,
-    pub(crate) fit: placement::Fit,
-}
 
 /// A joint that is a mating.
 #[derive(Debug, Clone, Copy)]

@@ -5,7 +5,9 @@ use crate::correlation::correlate;
 use crate::index::{Entry, Hit, Index, Windows, shape_distance};
 use crate::outline::{Outline, Segment};
 use crate::paper;
-use crate::search::{self, Joint, Mated, Outcome};
+use crate::params::{Budget, Time};
+use crate::placement::Joint;
+use crate::search::{self, Mated, Outcome};
 use crate::{Assembly, Mating, Params, ParamsError, Piece, Placement, Policy, TableCounts, Timings, frame, placement};
 use nalgebra::Isometry2;
 use rayon::prelude::*;
@@ -96,25 +98,6 @@ pub struct Posed {
     pub residual: f64,
     /// Fitted clearance, in pixels.
     pub clearance: f64,
-}
-
-/// When a solution has to come to an end. [`Solver::solve`] measures the time against [`Params::time_budget`]; another
-/// measure can be given to [`Solver::solve_within`].
-pub trait Budget: Sync {
-    /// The part that is used up; from 1 on the best assembly so far is taken.
-    fn spent(&self) -> f64;
-}
-
-/// Wall-clock time; without a limit it never runs out.
-struct Time {
-    begin: Instant,
-    seconds: f64,
-}
-
-impl Budget for Time {
-    fn spent(&self) -> f64 {
-        if self.seconds > 0.0 { self.begin.elapsed().as_secs_f64() / self.seconds } else { 0.0 }
-    }
 }
 
 /// Part of the budget after which no more candidates are looked for: what has been found is to be assembled, too.
