@@ -51,6 +51,7 @@ fn cases() -> Vec<Case> {
         case("strip", Options { wavy: 0.0, ..grid(1, 6) }),
         case("15x20", small(15, 20)),
         case("25x40", small(25, 40)),
+        case("worn_25x40", Options { noise: 10.0, blur: 2.0, vignette: 0.3, clearance: [0.0, 2.0], ..small(25, 40) }),
         exact("exact25x40", small(25, 40)),
         exact("exact100x100", small(100, 100)),
     ]
