@@ -8,7 +8,7 @@
 
 use anyhow::Context;
 use jigsaw::generate::{Options, Puzzle, Score};
-use jigsaw::{Assembly, Params, Piece, Policy, Solver, TableCounts};
+use jigsaw::{Assembly, Mating, Params, Piece, Policy, Solver, TableCounts};
 use std::fmt::Write;
 use std::path::{Path, PathBuf};
 
@@ -22,6 +22,14 @@ struct Trial {
     pieces: Vec<Piece>,
     /// Greedy descent, the same with backtracking, the default policy.
     runs: [(Assembly, Score); 3],
+}
+
+impl Trial {
+    /// The score of one mating by itself.
+    fn score_of(&self, mating: &Mating) -> Score {
+        let alone = Assembly { matings: vec![mating.clone()], ..Assembly::default() };
+        self.puzzle.score(&self.pieces, &alone)
+    }
 }
 
 const NAMES: [&str; 3] = ["`policy: paper`, greedy", "`policy: paper`, backtracking", "default"];
@@ -93,8 +101,7 @@ fn draw(path: &Path, trial: &Trial, assembly: &Assembly) -> anyhow::Result<()> {
     for m in &assembly.matings {
         let Some(p) = placed.iter().find(|p| p.piece == m.positive_piece) else { continue };
         let at = p.puzzle_from_image * trial.pieces[m.positive_piece].features.isthmuses[m.positive_isthmus].point;
-        let alone = Assembly { matings: vec![m.clone()], ..Assembly::default() };
-        if trial.puzzle.score(&trial.pieces, &alone).right_matings == 1 {
+        if trial.score_of(m).right_matings == 1 {
             writeln!(shapes, "<circle cx='{:.1}' cy='{:.1}' r='{:.1}' fill='#0072b2'/>", at.x, at.y, 0.6 * MARK)?;
         } else {
             let (x, y) = (at.x, at.y);
@@ -223,10 +230,7 @@ fn page(
     }
     let rows: Vec<(&str, TableCounts)> = NAMES.iter().zip(&shown.runs).map(|(n, r)| (*n, r.0.table)).collect();
     // The mating on which the descent founders: the best-ranked wrong one.
-    let wrong = greedy.0.matings.iter().filter(|m| {
-        let alone = Assembly { matings: vec![(*m).clone()], ..Assembly::default() };
-        shown.puzzle.score(&shown.pieces, &alone).wrong_matings == 1
-    });
+    let wrong = greedy.0.matings.iter().filter(|m| shown.score_of(m).wrong_matings == 1);
     let mismatch = wrong.min_by(|p, q| p.ave_gap.total_cmp(&q.ave_gap));
     let mismatch = mismatch.map_or_else(
         || "it takes no wrong pair, but can't join all pieces up".to_owned(),

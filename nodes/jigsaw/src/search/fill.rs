@@ -109,10 +109,9 @@ impl Assembler<'_> {
 
     /// Every piece left over in every free place that some candidate leads to; of one place the best pose.
     fn trials(&self) -> Vec<Trial> {
-        let alone = |p: usize| self.state.alone(p);
         let edges: Vec<(usize, usize)> = (0..self.edges.len())
-            .filter(|k| alone(self.edges[*k].a) != alone(self.edges[*k].b) && self.free(*k))
-            .map(|k| (k, if alone(self.edges[k].a) { self.edges[k].a } else { self.edges[k].b }))
+            .filter(|k| self.state.alone(self.edges[*k].a) != self.state.alone(self.edges[*k].b) && self.free(*k))
+            .map(|k| (k, if self.state.alone(self.edges[k].a) { self.edges[k].a } else { self.edges[k].b }))
             .collect();
         let mut tries = vec![0; self.outlines.len()];
         edges.iter().for_each(|(_, piece)| tries[*piece] += 1);
