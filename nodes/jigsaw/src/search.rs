@@ -911,10 +911,7 @@ impl Assembler<'_> {
                     if area <= OVERLAP * self.outlines[p].scale * self.outlines[q].scale {
                         continue;
                     }
-                    let weight = |k: usize| {
-                        joined[k].iter().map(|j| AGREEMENT + self.model.evidence(self.edges[*j].cost)).sum::<f64>()
-                    };
-                    evict.push(if weight(p) < weight(q) { p } else { q });
+                    evict.push(if self.weight(&joined[p]) < self.weight(&joined[q]) { p } else { q });
                 }
             }
             // Matings that the adjusted poses contradict hold nothing.
@@ -998,8 +995,6 @@ impl Assembler<'_> {
         const EXCEPTIONS: usize = 4;
         let (ia, ib, pose) = self.common_pose(group);
         let joined = self.joined_at();
-        let weight =
-            |k: usize| joined[k].iter().map(|j| AGREEMENT + self.model.evidence(self.edges[*j].cost)).sum::<f64>();
         let mut losers = Vec::new();
         for p in self.state.members(ia) {
             let here = pose * self.state.pose[p];
@@ -1007,7 +1002,7 @@ impl Assembler<'_> {
                 let q_from_p = self.state.pose[q].inverse() * here;
                 let area = self.memory.overlap(self.outlines[p], self.outlines[q], &q_from_p);
                 if area > self.tolerated() * self.outlines[p].scale * self.outlines[q].scale {
-                    losers.push(if weight(p) < weight(q) { p } else { q });
+                    losers.push(if self.weight(&joined[p]) < self.weight(&joined[q]) { p } else { q });
                 }
             }
         }
@@ -1019,7 +1014,12 @@ impl Assembler<'_> {
 
     /// What the assembly is worth: the evidence of its matings.
     fn worth(&self) -> f64 {
-        self.state.joined().iter().map(|k| AGREEMENT + self.model.evidence(self.edges[*k].cost)).sum()
+        self.weight(self.state.joined())
+    }
+
+    /// The evidence of some matings.
+    fn weight(&self, matings: &[usize]) -> f64 {
+        matings.iter().map(|k| AGREEMENT + self.model.evidence(self.edges[*k].cost)).sum()
     }
 
     /// Backtracking: a piece left over that would fit where another sits is tried in its place; what is worth less
