@@ -61,12 +61,14 @@ class Cyclone:
         self.domain = Domain(domain, LOOPBACK)
         self.participant = DomainParticipant(domain)
 
-    def first(self, topic, idl, timeout):
-        """The first sample of a latched ROS topic."""
+    def latched(self, topic, idl, timeout, wanted):
+        """The first sample of a latched ROS topic that is `wanted`: older ones may come ahead of the newest."""
         qos = Qos(
             Policy.Reliability.Reliable(duration(seconds=1)),
             Policy.Durability.TransientLocal,
             Policy.History.KeepLast(1),
         )
         reader = DataReader(self.participant, Topic(self.participant, f"rt{topic}", idl), qos)
-        return next(iter(reader.take_iter(timeout=duration(seconds=timeout))))
+        sample = next(filter(wanted, reader.take_iter(timeout=duration(seconds=timeout))), None)
+        assert sample is not None, f"nothing more on {topic} for {timeout} s, and none of what came is the one wanted"
+        return sample
