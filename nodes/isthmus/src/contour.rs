@@ -34,7 +34,7 @@ mod iso;
 mod restore;
 
 use crate::Point;
-use crate::mask::Cutout;
+use crate::cutout::Cutout;
 use band::{Band, Blurred, Raw};
 use iso::{Contours, Raster, Start};
 use nalgebra::Vector2;

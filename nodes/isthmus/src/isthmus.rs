@@ -23,17 +23,9 @@
 
 use crate::Point;
 use crate::contour::Border;
+pub use crate::skeleton::Polarity;
 use crate::skeleton::{NO_NEIGHBOUR, Triangulation};
 use nalgebra::Vector2;
-
-/// On which side of the border an isthmus line runs.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
-pub enum Polarity {
-    /// Inside the shape (endoskeleton): the neck of a tab.
-    Positive,
-    /// Outside (exoskeleton): the mouth of a blank.
-    Negative,
-}
 
 /// An isthmus line with its match segment.
 #[derive(Debug, Clone, PartialEq)]

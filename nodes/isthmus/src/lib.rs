@@ -13,13 +13,15 @@
 //!
 //! Coordinates are pixels of the source frame: x right, y **down**, pixel centres at whole numbers.
 
+mod changes;
 pub mod contour;
+mod cutout;
 pub mod isthmus;
 pub mod mask;
 pub mod profile;
 pub mod skeleton;
 
-use crate::isthmus::Polarity;
+use crate::skeleton::Polarity;
 
 /// A point of the source frame: pixels, x right, y down, pixel centres at whole numbers.
 pub type Point = nalgebra::Point2<f64>;

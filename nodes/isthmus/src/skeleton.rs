@@ -36,8 +36,16 @@
 
 use crate::Point;
 use crate::contour::Border;
-use crate::isthmus::Polarity;
 use nalgebra::Vector2;
+
+/// On which side of the border a skeleton or an isthmus line runs.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
+pub enum Polarity {
+    /// Inside the shape (endoskeleton): the neck of a tab.
+    Positive,
+    /// Outside (exoskeleton): the mouth of a blank.
+    Negative,
+}
 
 /// A point of the skeleton with the radius of the largest empty disc around it.
 #[derive(Debug, Clone, Copy, PartialEq)]

@@ -5,7 +5,7 @@
 
 use super::iso::{Picture, Start};
 use crate::Point;
-use crate::mask::changes;
+use crate::changes::changes;
 
 /// The pixels as they are.
 #[derive(Clone, Copy)]

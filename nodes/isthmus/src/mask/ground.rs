@@ -4,7 +4,7 @@
 //! the frame's outer rows and columns, tell the ground from the shapes. A quadratic surface through the ground's
 //! blocks follows uneven light; what differs from it by more than its scatter is shape.
 
-use super::{Frame, PixelFormat};
+use super::frame::Frame;
 use nalgebra::{Matrix6, Vector6};
 
 /// Means over square blocks of pixels.
@@ -403,14 +403,4 @@ pub(super) fn quantile(values: &mut [f32], q: f64) -> f32 {
     }
     let k = ((values.len() - 1) as f64 * q) as usize;
     *values.select_nth_unstable_by(k, f32::total_cmp).1
-}
-
-impl PixelFormat {
-    /// Bytes of a pixel.
-    pub(super) fn channels(self) -> usize {
-        match self {
-            Self::Grey => 1,
-            Self::Rgb => 3,
-        }
-    }
 }

@@ -1,6 +1,8 @@
 //! Connected components of a binary picture as runs of pixels (A. Rosenfeld, J. L. Pfaltz, *Sequential operations in digital
 //! picture processing*, J. ACM 13, 1966; on runs, with union-find): one pass, memory linear in the number of runs.
 
+use crate::changes::changes;
+
 /// Neighbouring pixels of one row.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Run {
@@ -22,35 +24,6 @@ pub(super) struct Component {
     pub(super) right: usize,
     /// One past the lowest row.
     pub(super) bottom: usize,
-}
-
-/// Tells where in a row of pixels `set` begins to hold (`true`) and where it ceases to (`false`), from left to right; before the row
-/// it does not hold.
-pub(crate) fn changes<P: Copy>(row: &[P], set: impl Fn(P) -> bool, mut change: impl FnMut(usize, bool)) {
-    /// Pixels that are looked at together, as bits of a number; most chunks are uniform.
-    const CHUNK: usize = 32;
-    let mut holds = false;
-    let (chunks, rest) = row.as_chunks::<CHUNK>();
-    for (k, chunk) in chunks.iter().enumerate() {
-        let count = chunk.iter().fold(0u8, |n, &p| n + u8::from(set(p)));
-        if usize::from(count) == if holds { CHUNK } else { 0 } {
-            continue;
-        }
-        let bits = chunk.iter().rev().fold(0u32, |bits, &p| bits << 1 | u32::from(set(p)));
-        // A bit for each pixel that differs from the one before.
-        let mut differ = bits ^ (bits << 1 | u32::from(holds));
-        while differ != 0 {
-            holds = !holds;
-            change(k * CHUNK + differ.trailing_zeros() as usize, holds);
-            differ &= differ - 1;
-        }
-    }
-    for (k, &p) in rest.iter().enumerate() {
-        if set(p) != holds {
-            holds = !holds;
-            change(chunks.len() * CHUNK + k, holds);
-        }
-    }
 }
 
 /// Runs and components, filled row by row.

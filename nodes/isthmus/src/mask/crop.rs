@@ -1,0 +1,219 @@
+//! A component with its surroundings, cut out of the frame pixel by pixel, in a form in which half-way between two fixed levels is the border.
+
+use super::frame::{Frame, PixelFormat};
+use super::ground::{median, quantile};
+use super::levels::{Levels, RowSource};
+use super::runs::{Component, Components};
+use super::standing::{NOBODY, Standing};
+use crate::Point;
+use crate::cutout::{Aoi, Cutout};
+
+/// Pixels of ground round a shape in its cutout: room for the blur that the contour may need.
+const MARGIN: usize = 8;
+/// Greatest contrast of a cutout that had to be divided by the local contrast, in grey levels: shape and ground keep some room.
+const MAX_DIVIDED_CONTRAST: f32 = 180.0;
+/// Standard deviations of noise for which there is room beyond the levels of such a cutout: clipping is a bias.
+const DIVIDED_ROOM: f32 = 4.0;
+/// Neighbours of a shape smaller than this, in pixels, stay in its cutout: noise makes them of the outer half of a blurred edge, and
+/// without them, as without the holes in its inner half, the edge would lie elsewhere.
+const MIN_ERASED: usize = 16;
+/// Most differences of neighbouring pixels looked at to measure the noise: beyond, the figure gets no better.
+const NOISE_SAMPLES: usize = 2_000;
+/// Half the width of the cut between two shapes, in pixels: pixels on either side of it are no neighbours.
+const CUT: f64 = 1.0;
+
+/// The surroundings of a component.
+#[derive(Debug, Clone, Default)]
+pub(super) struct Crop {
+    pub(super) x: i32,
+    pub(super) y: i32,
+    pub(super) width: usize,
+    pub(super) height: usize,
+    pub(super) pixels: Vec<u8>,
+    pub(super) shape_level: f32,
+    pub(super) ground_level: f32,
+    pub(super) noise_level: f32,
+    /// Contrast in the grey levels of the frame.
+    pub(super) contrast: f32,
+}
+
+impl Crop {
+    /// Cuts a component's surroundings out of the frame.
+    pub(super) fn take(&mut self, frame: &Frame<'_>, standing: &Standing<'_>, k: usize) {
+        let Standing { blocks, ground, components, owner } = *standing;
+        let c = components.list[k];
+        let (block, columns) = (blocks.size, blocks.columns);
+        let levels = Levels::of(standing, k);
+        let crop = self;
+        let margin = MARGIN + block;
+        let rows = RowSource { frame, ground, block };
+        (crop.x, crop.y) = ((c.left * block) as i32 - margin as i32, (c.top * block) as i32 - margin as i32);
+        crop.width = (c.right - c.left) * block + 2 * margin;
+        crop.height = (c.bottom - c.top) * block + 2 * margin;
+        crop.contrast = levels.contrast;
+        let plain = levels.uniform && frame.format == PixelFormat::Grey;
+        if plain {
+            crop.ground_level = levels.ground;
+            // A sum of rounded numbers; a level is one of the 8-bit scale.
+            crop.shape_level = (levels.ground + levels.sense * levels.contrast).clamp(0.0, 255.0);
+        } else if levels.uniform {
+            (crop.shape_level, crop.ground_level) = (levels.contrast, 0.0);
+        } else {
+            // Half the contrast and the room above it fill half the scale.
+            let noise = ground.scatter * block as f32 / levels.contrast.max(f32::MIN_POSITIVE);
+            let contrast = (127.5 / (0.5 + DIVIDED_ROOM * noise)).min(MAX_DIVIDED_CONTRAST);
+            (crop.shape_level, crop.ground_level) = (127.5 + contrast / 2.0, 127.5 - contrast / 2.0);
+        }
+        let ground_pixel = crop.ground_level.round().clamp(0.0, 255.0) as u8;
+        crop.pixels.clear();
+        crop.pixels.resize(crop.width * crop.height, ground_pixel);
+        let label = k as u32;
+        for (row, out) in crop.pixels.chunks_exact_mut(crop.width).enumerate() {
+            let y = crop.y + row as i32;
+            if y < 0 || y >= frame.height as i32 {
+                continue;
+            }
+            let y = y as usize;
+            let from = crop.x.max(0) as usize;
+            let to = frame.width.min((crop.x + crop.width as i32) as usize);
+            let out = &mut out[(from as i32 - crop.x) as usize..][..to - from];
+            let source = frame.row(y);
+            let owners = &owner[y / block * columns..][..columns];
+            if plain {
+                out.copy_from_slice(&source[from..to]);
+            } else {
+                levels.fill_row(&rows, (y, from), out, [crop.shape_level, crop.ground_level]);
+            }
+            // What belongs to other components is made ground.
+            let within = from / block..to.div_ceil(block);
+            let is_foreign = |owner: u32| owner != label && owner != NOBODY;
+            if owners[within.clone()].iter().fold(0, |count, owner| count + u32::from(is_foreign(*owner))) == 0 {
+                continue;
+            }
+            for (column, owner) in within.clone().zip(&owners[within]) {
+                if is_foreign(*owner) {
+                    let (start, end) = ((column * block).max(from), ((column + 1) * block).min(to));
+                    out[start - from..end - from].fill(ground_pixel);
+                }
+            }
+        }
+        crop.noise_level = crop.noise(standing, k);
+    }
+
+    /// Standard deviation of the grey levels , from differences of neighbouring pixels, in shape and ground; the larger.
+    fn noise(&self, standing: &Standing<'_>, k: usize) -> f32 {
+        /// Lower quartile and median of the absolute difference of two normal numbers, in standard deviations.
+        const QUARTILE: f32 = 0.450_6;
+        const MEDIAN: f32 = 0.953_9;
+        let Standing { blocks, ground, owner, .. } = *standing;
+        let (block, columns) = (blocks.size, blocks.columns);
+        let (mut shape, mut clear) = (Vec::new(), Vec::new());
+        let step = (self.width * self.height / NOISE_SAMPLES).max(1);
+        for at in (0..self.pixels.len() - 1).step_by(step) {
+            let (x, y) = (self.x + (at % self.width) as i32, self.y + (at / self.width) as i32);
+            let (column, row) = (x.max(0) as usize / block, y.max(0) as usize / block);
+            if x < 0 || y < 0 || column >= columns || row >= blocks.rows || (at + 1) % self.width == 0 {
+                continue;
+            }
+            let here = row * columns + column;
+            let (before, after) = (column.saturating_sub(1), (column + 1).min(columns - 1));
+            let neighbours = [row * columns + before, row * columns + after, row.saturating_sub(1) * columns + column];
+            let stands_out = |b: &usize| ground.residual[*b] > ground.threshold;
+            let difference = f32::from(self.pixels[at].abs_diff(self.pixels[at + 1]));
+            if stands_out(&here) && owner[here] == k as u32 && neighbours.iter().all(stands_out) {
+                shape.push(difference);
+            } else if owner[here] == NOBODY {
+                clear.push(difference);
+            }
+        }
+        // Print and texture are not noise: half of a shape is free of them.
+        (quantile(&mut shape, 0.25) / QUARTILE).max(median(clear) / MEDIAN)
+    }
+
+    /// Connects the pixels that are beyond half-way from ground to shape.
+    pub(super) fn label(&self, components: &mut Components) {
+        let level = (self.shape_level + self.ground_level) / 2.0;
+        components.clear();
+        for (y, row) in self.pixels.chunks_exact(self.width).enumerate() {
+            components.begin_row(y);
+            if self.shape_level > self.ground_level {
+                let least = level.floor() as u8;
+                components.add_row(row, |p| p > least);
+            } else {
+                let most = level.ceil() as u8;
+                components.add_row(row, |p| p < most);
+            }
+        }
+        components.close();
+    }
+
+    /// Bounding box of a component in the source frame.
+    pub(super) fn aoi(&self, c: &Component) -> Aoi {
+        Aoi {
+            x: self.x + c.left as i32,
+            y: self.y + c.top as i32,
+            width: (c.right - c.left) as u32,
+            height: (c.bottom - c.top) as u32,
+        }
+    }
+
+    /// Grey level of ground.
+    fn ground_pixel(&self) -> u8 {
+        self.ground_level.round().clamp(0.0, 255.0) as u8
+    }
+
+    /// The part round a component, all others made ground.
+    pub(super) fn cutout(&self, components: &Components, index: usize) -> Cutout {
+        let c = &components.list[index];
+        let (left, top) = (c.left.saturating_sub(MARGIN), c.top.saturating_sub(MARGIN));
+        let (right, bottom) =
+            (self.width.min(c.right + MARGIN), (self.pixels.len() / self.width).min(c.bottom + MARGIN));
+        let width = right - left;
+        let mut pixels = Vec::with_capacity(width * (bottom - top));
+        for y in top..bottom {
+            pixels.extend_from_slice(&self.pixels[y * self.width + left..y * self.width + right]);
+        }
+        let ground = self.ground_pixel();
+        let is_erased = |label: usize| label != index && components.list[label].area >= MIN_ERASED;
+        for run in components.runs.iter().filter(|r| is_erased(r.label) && (top..bottom).contains(&r.row)) {
+            let (start, end) = (run.start.clamp(left, right), run.end.clamp(left, right));
+            pixels[(run.row - top) * width + start - left..(run.row - top) * width + end - left].fill(ground);
+        }
+        Cutout {
+            aoi: self.aoi(c),
+            window: Aoi {
+                x: self.x + left as i32,
+                y: self.y + top as i32,
+                width: width as u32,
+                height: (bottom - top) as u32,
+            },
+            pixels,
+            shape_level: self.shape_level,
+            ground_level: self.ground_level,
+            noise_level: self.noise_level,
+        }
+    }
+
+    /// Makes ground of the pixels along a line, so that what lies on either side comes apart.
+    pub(super) fn cut(&mut self, [from, to]: [Point; 2]) {
+        let local = |p: Point| Point::new(p.x - f64::from(self.x), p.y - f64::from(self.y));
+        let (from, to) = (local(from), local(to));
+        let ground = self.ground_pixel();
+        let (low, high) = (from.inf(&to), from.sup(&to));
+        let rows = self.pixels.len() / self.width;
+        let range = |low: f64, high: f64, count: usize| {
+            let first = (low - CUT).floor().clamp(0.0, count as f64) as usize;
+            first..((high + CUT).ceil() + 1.0).clamp(0.0, count as f64) as usize
+        };
+        let along = to - from;
+        for y in range(low.y, high.y, rows) {
+            for x in range(low.x, high.x, self.width) {
+                let to = Point::new(x as f64, y as f64) - from;
+                let t = (to.dot(&along) / along.norm_squared().max(f64::MIN_POSITIVE)).clamp(0.0, 1.0);
+                if (to - along * t).norm() <= CUT {
+                    self.pixels[y * self.width + x] = ground;
+                }
+            }
+        }
+    }
+}

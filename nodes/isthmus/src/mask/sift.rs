@@ -1,0 +1,156 @@
+//! Which of the shapes found are shapes of their own, beside the others.
+
+use super::crop::Crop;
+use super::frame::Frame;
+use super::ground::median;
+use super::runs::Components;
+use super::segmentation::{Parameters, Reason, Rejected, Segmentation};
+use crate::Point;
+use crate::contour::Border;
+use crate::cutout::Cutout;
+use crate::isthmus::{self, Polarity};
+use crate::skeleton::Triangulation;
+
+/// A shape alone in the frame may touch the edges if it spans this part of the frame in both directions: then the frame
+/// was cropped to the shape.
+const TIGHT_SPAN: f64 = 0.9;
+/// ... and if it covers at most this part of the frame's rim.
+const TIGHT_CONTACT: f64 = 0.6;
+/// ... and has this part of all the area that stands out.
+const TIGHT_SHARE: f64 = 0.9;
+/// Least number of shapes in a frame whose median area says what one shape has.
+const TOUCHING_SHAPES: usize = 3;
+/// Least area of two shapes that touch, in median areas: the two smallest pieces of a puzzle are larger together.
+const TOUCHING_AREA: f64 = 1.5;
+/// Least area of each of the two, in median areas.
+const TOUCHING_LOBE: f64 = 0.5;
+/// Greatest width of the place where two shapes touch, as a part of the square root of the median area: the neck of a tab
+/// that reaches into the other's blank is not wider.
+const TOUCHING_WIDTH: f64 = 0.35;
+/// Greatest width of such a place at which the two are cut apart, as a part of the same: the necks of tabs are wider, and cut there the one
+/// would keep the other's tab.
+const SEPARABLE_WIDTH: f64 = 0.1;
+
+/// A shape that may still be rejected beside the others.
+pub(super) struct Found {
+    pub(super) cutout: Cutout,
+    pub(super) area: usize,
+    pub(super) contact: usize,
+    pub(super) contrast: f32,
+}
+
+/// Rejects what is cut by the frame, or small or faint beside the other shapes.
+pub(super) fn sift(
+    frame: &Frame<'_>,
+    parameters: &Parameters,
+    found: Vec<Found>,
+    mut rejected: Vec<Rejected>,
+) -> Segmentation {
+    let total: usize = found.iter().map(|f| f.area).sum();
+    let mut by_area: Vec<(usize, f32)> = found.iter().map(|f| (f.area, f.contrast)).collect();
+    by_area.sort_unstable_by_key(|f| f.0);
+    let mut above = total;
+    let typical_area = by_area
+        .iter()
+        .find(|f| {
+            above -= f.0;
+            above * 2 <= total
+        })
+        .map_or(0, |f| f.0);
+    let typical_contrast = median(by_area.iter().filter(|f| 2 * f.0 >= typical_area).map(|f| f.1).collect());
+    // The lower median, small fry aside: of three shapes two of which touch, a single one.
+    let usual: Vec<usize> = by_area
+        .iter()
+        .map(|f| f.0)
+        .filter(|a| *a as f64 >= parameters.min_relative_area * typical_area as f64)
+        .collect();
+    let median_area = if usual.len() < TOUCHING_SHAPES { usize::MAX } else { usual[(usual.len() - 1) / 2] };
+    let rim = 2 * (frame.width + frame.height);
+    let mut cutouts = Vec::new();
+    let mut separated = Vec::new();
+    let mut open = found;
+    while let Some(f) = open.pop() {
+        let aoi = f.cutout.aoi;
+        let tight = f64::from(aoi.width) >= TIGHT_SPAN * frame.width as f64
+            && f64::from(aoi.height) >= TIGHT_SPAN * frame.height as f64
+            && f.contact as f64 <= TIGHT_CONTACT * rim as f64
+            && f.area as f64 >= TIGHT_SHARE * total as f64;
+        let reason = if (f.area as f64) < parameters.min_relative_area * typical_area as f64 {
+            Some(Reason::Small)
+        } else if f64::from(f.contrast) < parameters.min_relative_contrast * f64::from(typical_contrast) {
+            Some(Reason::Faint)
+        } else if f.contact > 0 && !tight {
+            Some(Reason::CutByFrame)
+        } else if f.area as f64 >= TOUCHING_AREA * median_area as f64
+            && let Some(contact) = contact(&f.cutout, median_area as f64)
+        {
+            let parts = part(&f, contact, median_area as f64);
+            if parts.is_empty() {
+                Some(Reason::Touching)
+            } else {
+                separated.push(aoi);
+                open.extend(parts);
+                continue;
+            }
+        } else {
+            None
+        };
+        match reason {
+            Some(reason) => rejected.push(Rejected { aoi, area: f.area, reason }),
+            None => cutouts.push(f.cutout),
+        }
+    }
+    separated.sort_by_key(|aoi| (aoi.y, aoi.x));
+    cutouts.sort_by_key(|c| (c.aoi.y, c.aoi.x));
+    rejected.sort_by_key(|r| (r.aoi.y, r.aoi.x));
+    Segmentation { cutouts, rejected, separated }
+}
+
+/// The narrowest place at which two shapes of about a given area each touch: an isthmus with most of a shape on either side.
+fn contact(cutout: &Cutout, area: f64) -> Option<[Point; 2]> {
+    let (border, noise) = Border::from_cutout(cutout).ok()?;
+    let triangulation = Triangulation::new(&border).ok()?;
+    let whole = border.area();
+    let joins_two = |i: &isthmus::Isthmus| {
+        let count = (i.path_length / border.spacing).ceil() as usize + 1;
+        let lobe = Border { points: border.sample(i.arc, 0.0, count), spacing: border.spacing }.area();
+        i.polarity == Polarity::Positive
+            && i.width <= TOUCHING_WIDTH * area.sqrt()
+            && lobe.min(whole - lobe) >= TOUCHING_LOBE * area
+    };
+    let contacts = isthmus::find(&border, &triangulation, noise).into_iter().filter(joins_two);
+    contacts.min_by(|a, b| a.width.total_cmp(&b.width)).map(|i| i.critical_points)
+}
+
+/// Cuts a shape apart at a contact, if that is so narrow that it is no neck; the parts, none if they do not come apart.
+fn part(found: &Found, contact: [Point; 2], area: f64) -> Vec<Found> {
+    if (contact[1] - contact[0]).norm() > SEPARABLE_WIDTH * area.sqrt() {
+        return Vec::new();
+    }
+    let cutout = &found.cutout;
+    let mut crop = Crop {
+        x: cutout.window.x,
+        y: cutout.window.y,
+        width: cutout.window.width as usize,
+        pixels: cutout.pixels.clone(),
+        shape_level: cutout.shape_level,
+        ground_level: cutout.ground_level,
+        noise_level: cutout.noise_level,
+        ..Crop::default()
+    };
+    crop.cut(contact);
+    let mut components = Components::default();
+    crop.label(&mut components);
+    let large = |index: &usize| components.list[*index].area as f64 >= TOUCHING_LOBE * area;
+    let parts: Vec<usize> = (0..components.list.len()).filter(large).collect();
+    if parts.len() < 2 {
+        return Vec::new();
+    }
+    let part = |index: usize| Found {
+        cutout: crop.cutout(&components, index),
+        area: components.list[index].area,
+        contact: 0,
+        contrast: found.contrast,
+    };
+    parts.into_iter().map(part).collect()
+}

@@ -1,0 +1,97 @@
+//! What stands out from the ground, in blocks, and to which component each block belongs.
+
+use super::ground::{Blocks, Ground};
+use super::runs::Components;
+
+/// Owner of the blocks that belong to no component.
+pub(super) const NOBODY: u32 = u32::MAX;
+/// Greatest depth that is told apart, in blocks: beyond the blur of any edge worth measuring.
+pub(super) const MAX_DEPTH: u8 = 7;
+
+/// Makes every coarse component own its blocks and the free ones next to them.
+pub(super) fn claim(blocks: &Blocks, coarse: &Components, owner: &mut Vec<u32>) {
+    let (columns, rows) = (blocks.columns, blocks.rows);
+    owner.clear();
+    owner.resize(columns * rows, NOBODY);
+    for run in &coarse.runs {
+        let label = run.label as u32;
+        owner[run.row * columns + run.start..run.row * columns + run.end].fill(label);
+    }
+    for run in &coarse.runs {
+        let label = run.label as u32;
+        for row in run.row.saturating_sub(1)..rows.min(run.row + 2) {
+            let (start, end) = (run.start.saturating_sub(1), columns.min(run.end + 1));
+            for owner in &mut owner[row * columns + start..row * columns + end] {
+                *owner = if *owner == NOBODY { label } else { *owner };
+            }
+        }
+    }
+}
+
+/// Blocks that stand out from a ground, joined to components.
+#[derive(Clone, Copy)]
+pub(super) struct Standing<'a> {
+    pub(super) blocks: &'a Blocks,
+    pub(super) ground: &'a Ground,
+    pub(super) components: &'a Components,
+    /// For each block the component that owns it, or [`NOBODY`]: its blocks and those next to them.
+    pub(super) owner: &'a [u32],
+}
+
+impl Standing<'_> {
+    /// Whether a block belongs to a component itself, rather than to its surroundings.
+    pub(super) fn is_of(&self, k: usize, column: usize, row: usize) -> bool {
+        let block = row * self.blocks.columns + column;
+        self.owner[block] == k as u32 && self.ground.residual[block] > self.ground.threshold
+    }
+
+    /// How many blocks deep within a component each block of its box lies (1 along its border, 0 outside of it), up to
+    /// [`MAX_DEPTH`]; what lies beyond the frame counts as within.
+    pub(super) fn depths(&self, k: usize) -> Vec<u8> {
+        let c = self.components.list[k];
+        let (width, height) = (c.right - c.left, c.bottom - c.top);
+        let mut depths = vec![0; width * height];
+        for run in self.components.runs.iter().filter(|run| run.label == k) {
+            for column in run.start..run.end {
+                if self.is_of(k, column, run.row) {
+                    depths[(run.row - c.top) * width + column - c.left] = MAX_DEPTH;
+                }
+            }
+        }
+        let (left, top) = (c.left > 0, c.top > 0);
+        let (right, bottom) = (c.right < self.blocks.columns, c.bottom < self.blocks.rows);
+        // Distance along rows, columns and diagonals: one pass forward over the neighbours that come before, one back.
+        let relax = |depths: &mut [u8], x: usize, y: usize, sense: isize| {
+            let at = y * width + x;
+            if depths[at] == 0 {
+                return;
+            }
+            for (dx, dy) in [(-1, 0), (-1, -1), (0, -1), (1, -1)] {
+                let (u, v) = (x as isize + sense * dx, y as isize + sense * dy);
+                let open = (u < 0 && left)
+                    || (u >= width as isize && right)
+                    || (v < 0 && top)
+                    || (v >= height as isize && bottom);
+                let before = if open {
+                    0
+                } else if u < 0 || v < 0 || u >= width as isize || v >= height as isize {
+                    MAX_DEPTH
+                } else {
+                    depths[v as usize * width + u as usize]
+                };
+                depths[at] = depths[at].min(before + 1);
+            }
+        };
+        for y in 0..height {
+            for x in 0..width {
+                relax(&mut depths, x, y, 1);
+            }
+        }
+        for y in (0..height).rev() {
+            for x in (0..width).rev() {
+                relax(&mut depths, x, y, -1);
+            }
+        }
+        depths
+    }
+}
