@@ -100,7 +100,7 @@ impl Crop {
         crop.noise_level = crop.noise(standing, k);
     }
 
-    /// Standard deviation of the grey levels , from differences of neighbouring pixels, in shape and ground; the larger.
+    /// Standard deviation of the grey levels, from differences of neighbouring pixels, in shape and ground; the larger.
     fn noise(&self, standing: &Standing<'_>, k: usize) -> f32 {
         /// Lower quartile and median of the absolute difference of two normal numbers, in standard deviations.
         const QUARTILE: f32 = 0.450_6;
