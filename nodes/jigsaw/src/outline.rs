@@ -212,17 +212,18 @@ impl Outline {
         (i, other, ((p - q).dot(&edge) / edge.norm_squared().max(f64::EPSILON)).clamp(0.0, 1.0))
     }
 
-    /// Signed distance of a point from the border, positive outside, if it is less than `reach`.
-    pub(crate) fn gap(&self, p: Point, reach: f64) -> Option<f64> {
+    /// Signed distance of a point from the border, positive outside, if it is less than `reach`, and the normal of the
+    /// border there (outward).
+    pub(crate) fn gap(&self, p: Point, reach: f64) -> Option<(f64, Vector2<f64>)> {
         let cell = self.raster.cell_of(p)?;
         if f64::from(self.raster.distance[cell]).abs() > reach + self.raster.cell {
             return None;
         }
         let (i, other, part) = self.foot(p, self.raster.nearest[cell] as usize);
         let normal = self.normals[i] * (1.0 - part as f32) + self.normals[other] * part as f32;
+        let normal = Vector2::new(f64::from(normal.x), f64::from(normal.y));
         let d = p - (self.points[i] + (self.points[other] - self.points[i]) * part);
-        let outside = d.x * f64::from(normal.x) + d.y * f64::from(normal.y) >= 0.0;
-        (d.norm() <= reach).then(|| if outside { d.norm() } else { -d.norm() })
+        (d.norm() <= reach).then(|| (d.norm().copysign(d.dot(&normal)), normal))
     }
 
     fn prepare(&self, index: usize, isthmus: &Isthmus) -> Segment {

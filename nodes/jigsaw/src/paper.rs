@@ -117,7 +117,7 @@ impl<'a> Judge<'a> {
         let width = path / points.len() as f64;
         points
             .iter()
-            .map(|p| outline.gap(pose * p, reach).unwrap_or(reach))
+            .map(|p| outline.gap(pose * p, reach).map_or(reach, |(gap, _)| gap))
             .fold((0.0, 0.0), |(pos, neg), d| if d < 0.0 { (pos - d * width, neg) } else { (pos, neg + d * width) })
     }
 }

@@ -1,41 +1,65 @@
 //! Filling what is left: a piece whose isthmuses alone don't decide is laid where its whole border fits best.
 //!
-//! Worn isthmuses, waves without a neck and corner pieces may have one bad candidate, or two that agree badly. For
-//! each piece left over and each candidate that leads to a free place:
+//! Worn isthmuses, waves without a neck and corner pieces may have one bad candidate, or two that agree badly; pieces
+//! that a scanner stretched agree with none. For each piece left over and each candidate that leads to a free place:
 //! 1. *Settle*: the pose is adjusted to all contacts of the outlines there, the assembly held.
-//! 2. *Gap*: mean distance, clearance taken off, between the piece's border and the nearest border of the assembly,
-//!    wherever there is one near: overlap, underlap and misfit in one figure (the paper's GAP over path length).
-//! 3. *Decision*: how large that figure is for pieces that are placed, and for strangers in the same places, is
-//!    measured, and how many strangers overlap so much that they drop out; a piece is placed if it fits like one of the
-//!    former, given how many places were tried for it, and leads its rivals.
+//! 2. *Gap*: mean distance, clearance and a small strain of the piece taken off, between its border and the nearest
+//!    border of the assembly, wherever one runs along it: overlap, underlap and misfit in one figure (the paper's GAP
+//!    over path length).
+//! 3. *Decision*: how large that figure is for pieces that are placed, and for strangers in the places of such, is
+//!    measured, and how many strangers overlap so much that they drop out, the more the more the place is enclosed; a
+//!    piece is placed if it fits like one of the former, given how many places were tried for it, and leads its rivals.
 //!
-//! Complexity O(pieces left · candidates · neighbours · border). A piece that touches the assembly nowhere, or that
-//! strangers equal, stays left over.
+//! Complexity O(pieces left · candidates · neighbours · border) in each round; a round places all that are sure. A piece
+//! that touches the assembly nowhere, or that strangers equal, stays left over.
 
 use super::{ACCEPT, Assembler, COARSE, Model, spread_of};
 use crate::posegraph::{Factor, minimise};
 use isthmus::Point;
-use nalgebra::{Isometry2, Translation2, UnitComplex};
+use nalgebra::{Isometry2, Matrix6, Translation2, UnitComplex, Vector2, Vector6};
 use rayon::prelude::*;
 
 /// Border farther than this from any other, in piece scales, lies open and says nothing.
 const NEAR: f64 = 0.12;
 /// Distances count at most this, in piece scales: one corner that is off shall not hide that all else fits.
 const CAP: f64 = 0.05;
-/// Part of the border near another that follows it: the rest turns away round the corners.
-const FOLLOWS: f64 = 0.75;
+/// Borders that follow one another have opposite normals, to 60° (cosine): elsewhere they part at a corner.
+const TURNED: f64 = -0.5;
+/// Part of the border that follows another by which a piece is judged: frays and rounded corners may be off.
+const FOLLOWS: f64 = 0.9;
 /// Part of a piece's border that must have another near: less than a side says little.
 const LEAST_SHARE: f64 = 0.2;
 /// Two poses whose centroids are nearer than this, in piece scales, claim the same place.
 const SAME_PLACE: f64 = 0.3;
 /// Adjustments until a pose has settled.
 const ROUNDS: usize = 4;
+/// Pieces are strained by about so much: flatbed scanners measure one axis 0.6 % longer, card swells, rows of a scan are
+/// 2 % off where the carriage jerks.
+const STRAIN: f64 = 0.01;
 /// Placed pieces that are looked at to learn how well they fit.
 const SAMPLE: usize = 100;
-/// Strangers that are tried in the gaps, to learn how badly they fit.
-const STRANGERS: usize = 300;
+/// Strangers that are tried in the places of others, to learn how badly they fit.
+const STRANGERS: usize = 400;
+/// Of these the ones whose place is most like another are compared with what is tried there.
+const ALIKE: usize = 100;
+/// Fewer figures don't show how they spread.
+const FEW: usize = 4;
 
-/// A piece in a place: by which candidate, in which pose (island from image), and how badly it fits (logarithm).
+/// An island, and the piece of it that is taken to be away.
+type Place = (usize, Option<usize>);
+
+/// How badly a piece fits in a place.
+#[derive(Debug, Clone, Copy)]
+struct Misfit {
+    /// Logarithm of the mean gap.
+    cost: f64,
+    /// Part of the border that has another near.
+    share: f64,
+    /// Greatest overlap with another piece, in squared piece scales.
+    overlap: f64,
+}
+
+/// A piece in a place: by which candidate, in which pose (island from image), and how badly it fits.
 #[derive(Debug, Clone, Copy)]
 struct Trial {
     piece: usize,
@@ -43,46 +67,105 @@ struct Trial {
     island: usize,
     pose: Isometry2<f64>,
     centre: Point,
-    cost: f64,
+    misfit: Misfit,
     /// Candidates by which a place was looked for, for this piece.
     tries: usize,
 }
 
-/// How pieces fit that are placed, and how strangers do.
-#[derive(Debug, Clone, Copy)]
+/// How pieces fit that are placed, and how strangers do in their places.
+#[derive(Debug, Clone)]
 struct Fitting {
     model: Model,
-    /// Logarithm of how rarely a stranger doesn't overlap.
-    rarity: f64,
+    /// How enclosed each stranger was, and whether it fits in without overlap, by the former.
+    strangers: Vec<(f64, bool)>,
 }
 
 impl Fitting {
     /// Logarithm of the odds that a piece belongs where it is tried.
     fn evidence(&self, trial: &Trial) -> f64 {
-        self.model.evidence(trial.cost) + self.rarity - (trial.tries.max(1) as f64).ln()
+        self.model.evidence(trial.misfit.cost) + self.rarity(trial.misfit.share) - (trial.tries.max(1) as f64).ln()
+    }
+
+    /// Logarithm of how rarely a stranger fits into a place as enclosed without overlap.
+    fn rarity(&self, share: f64) -> f64 {
+        let all = self.strangers.len();
+        let before = self.strangers.partition_point(|s| s.0 < share);
+        let first = before.saturating_sub(ALIKE / 2).min(all.saturating_sub(ALIKE));
+        let alike = &self.strangers[first..(first + ALIKE).min(all)];
+        let fitting = alike.iter().filter(|s| s.1).count();
+        ((alike.len() + 1) as f64 / (fitting + 1) as f64).ln()
     }
 }
 
+/// Where a piece's border has another near: place about the centroid, normal of the other border, and gap, clearance
+/// taken off, in the piece's own axes.
+struct Touch {
+    at: Vector2<f64>,
+    normal: Vector2<f64>,
+    gap: f64,
+}
+
+impl Touch {
+    /// How the gap grows with the motion (x, y, turn) and the strain (along x, along y, shear) of the piece.
+    fn slope(&self) -> Vector6<f64> {
+        let (r, n) = (self.at, self.normal);
+        Vector6::new(n.x, n.y, r.x * n.y - r.y * n.x, r.x * n.x, r.y * n.y, r.y * n.x + r.x * n.y)
+    }
+}
+
+/// The gaps that are left when a piece is moved, stretched and sheared a little to close them: robust least squares by
+/// reweighting, with a prior on the strain.
+fn unstrained(touches: &[Touch]) -> Vec<f64> {
+    let mut gaps: Vec<f64> = touches.iter().map(|t| t.gap).collect();
+    for _ in 0..ROUNDS {
+        let (middle, spread) = spread_of(&mut gaps.clone());
+        let width = (3.0 * spread).max(f64::MIN_POSITIVE);
+        let mut h = Matrix6::from_diagonal(&Vector6::new(0.0, 0.0, 0.0, 1.0, 1.0, 1.0)) * (spread / STRAIN).powi(2);
+        let mut g = Vector6::zeros();
+        for (touch, gap) in touches.iter().zip(&gaps) {
+            let weight = 1.0 / (1.0 + ((gap - middle) / width).powi(2)).powi(2);
+            let slope = touch.slope();
+            h += slope * slope.transpose() * weight;
+            g -= slope * (weight * touch.gap);
+        }
+        let Some(motion) = h.cholesky().map(|h| h.solve(&g)) else { break };
+        gaps = touches.iter().map(|t| t.gap + t.slope().dot(&motion)).collect();
+    }
+    gaps
+}
+
 impl Assembler<'_> {
-    /// Places pieces left over, the best fitting first, as long as one fits like those that are placed.
+    /// Places pieces left over, the best fitting first, as long as some fit like those that are placed.
     pub(super) fn fill(&mut self) {
+        let Some(fitting) = self.fitting() else { return };
         while !self.late() {
             let trials = self.trials();
-            let Some(fitting) = self.fitting(&trials) else { return };
-            let best = trials.iter().filter_map(|t| {
+            let sure = |t: &Trial| {
                 let evidence = fitting.evidence(t);
-                let lead = trials
-                    .iter()
-                    .filter(|o| (o.piece == t.piece) != self.same_place(o, t))
-                    .map(|o| evidence - fitting.evidence(o))
-                    .fold(f64::INFINITY, f64::min);
-                (evidence.min(lead) >= ACCEPT).then_some((evidence, t))
-            });
-            let Some((evidence, trial)) = best.max_by(|p, q| p.0.total_cmp(&q.0).then(q.1.edge.cmp(&p.1.edge))) else {
-                return;
+                let rivals = trials.iter().filter(|o| (o.piece == t.piece) != self.same_place(o, t));
+                let lead = rivals.map(|o| evidence - fitting.evidence(o)).fold(f64::INFINITY, f64::min);
+                (evidence.min(lead) >= ACCEPT).then_some((evidence, *t))
             };
-            let trial = *trial;
-            self.place(&trial, evidence);
+            let mut sure: Vec<(f64, Trial)> = trials.iter().filter_map(sure).collect();
+            sure.sort_by(|p, q| q.0.total_cmp(&p.0).then(p.1.edge.cmp(&q.1.edge)));
+            let mut islands: Vec<usize> = Vec::new();
+            for (_, t) in sure {
+                // What has been placed beside it meanwhile has a say.
+                let now = self.trial(t.edge, t.piece, None).filter(|now| now.misfit.overlap <= self.tolerated());
+                let now = now.map(|now| Trial { tries: t.tries, ..now }).map(|now| (fitting.evidence(&now), now));
+                let Some((evidence, now)) = now.filter(|now| now.0 >= ACCEPT && self.free(t.edge)) else { continue };
+                self.place(&now, evidence);
+                islands.push(now.island);
+            }
+            if islands.is_empty() {
+                return;
+            }
+            islands.sort_unstable();
+            islands.dedup();
+            // What fits beside them is judged by where they come to lie among their neighbours.
+            if self.params.pose_graph {
+                islands.into_iter().for_each(|island| self.adjust(island, COARSE));
+            }
         }
     }
 
@@ -101,10 +184,6 @@ impl Assembler<'_> {
                 self.take(k);
             }
         }
-        // What fits beside it is judged by where it comes to lie among its neighbours.
-        if self.params.pose_graph {
-            self.adjust(trial.island, COARSE);
-        }
     }
 
     /// Every piece left over in every free place that some candidate leads to; of one place the best pose.
@@ -115,9 +194,12 @@ impl Assembler<'_> {
             .collect();
         let mut tries = vec![0; self.outlines.len()];
         edges.iter().for_each(|(_, piece)| tries[*piece] += 1);
-        let tried = edges.par_iter().filter_map(|(k, piece)| self.trial(*k, *piece));
+        let tried = edges.par_iter().filter_map(|(k, piece)| self.trial(*k, *piece, None));
+        let tried = tried.filter(|t| t.misfit.overlap <= self.tolerated());
         let mut trials: Vec<Trial> = tried.map(|t| Trial { tries: tries[t.piece], ..t }).collect();
-        trials.sort_by(|p, q| p.piece.cmp(&q.piece).then(p.cost.total_cmp(&q.cost)).then(p.edge.cmp(&q.edge)));
+        trials.sort_by(|p, q| {
+            p.piece.cmp(&q.piece).then(p.misfit.cost.total_cmp(&q.misfit.cost)).then(p.edge.cmp(&q.edge))
+        });
         let mut kept: Vec<Trial> = Vec::new();
         for t in trials {
             if !kept.iter().rev().take_while(|o| o.piece == t.piece).any(|o| self.same_place(o, &t)) {
@@ -127,8 +209,8 @@ impl Assembler<'_> {
         kept
     }
 
-    /// A piece of a candidate where the other one says it belongs.
-    fn trial(&self, edge: usize, piece: usize) -> Option<Trial> {
+    /// A piece of a candidate where the other one says it belongs, as if one piece weren't there.
+    fn trial(&self, edge: usize, piece: usize, without: Option<usize>) -> Option<Trial> {
         let e = &self.edges[edge];
         let (held, pose) = if piece == e.a {
             (e.b, self.state.pose[e.b] * e.b_from_a)
@@ -136,26 +218,28 @@ impl Assembler<'_> {
             (e.a, self.state.pose[e.a] * e.b_from_a.inverse())
         };
         let island = self.state.island(held);
-        let pose = self.settled(piece, island, pose);
-        let (cost, worst) = self.misfit(piece, island, &pose)?;
+        let pose = self.settled(piece, (island, without), pose);
+        let misfit = self.misfit(piece, (island, without), &pose)?;
         let centre = pose * self.outlines[piece].centroid;
-        (worst <= self.tolerated()).then_some(Trial { piece, edge, island, pose, centre, cost, tries: 1 })
+        Some(Trial { piece, edge, island, pose, centre, misfit, tries: 1 })
     }
 
-    /// Pieces of an island near enough to touch a piece in a pose.
-    fn around(&self, piece: usize, island: usize, pose: &Isometry2<f64>) -> Vec<usize> {
+    /// Pieces of an island, but for one, near enough to touch a piece in a pose.
+    fn around(&self, piece: usize, place: Place, pose: &Isometry2<f64>) -> Vec<usize> {
+        let (island, without) = place;
         let centre = pose * self.outlines[piece].centroid;
         let reach = self.outlines[piece].radius + NEAR * self.scale;
-        let near = |q: &usize| *q != piece && (self.centre_of(*q) - centre).norm() <= reach + self.outlines[*q].radius;
-        self.state.members(island).filter(near).collect()
+        let apart = |q: &usize| *q != piece && Some(*q) != without;
+        let near = |q: &usize| (self.centre_of(*q) - centre).norm() <= reach + self.outlines[*q].radius;
+        self.state.members(island).filter(apart).filter(near).collect()
     }
 
     /// The pose of a piece adjusted to all contacts with an island, which is held.
-    fn settled(&self, piece: usize, island: usize, pose: Isometry2<f64>) -> Isometry2<f64> {
+    fn settled(&self, piece: usize, place: Place, pose: Isometry2<f64>) -> Isometry2<f64> {
         let mut settled = pose;
         for _ in 0..ROUNDS {
             let factors: Vec<Factor> = self
-                .around(piece, island, &settled)
+                .around(piece, place, &settled)
                 .into_iter()
                 // The island is the first node, which stays where it is.
                 .filter_map(|q| self.factor((piece, 1), (q, 0), &[settled, self.state.pose[q]], COARSE))
@@ -172,52 +256,57 @@ impl Assembler<'_> {
         settled
     }
 
-    /// Logarithm of the mean gap between a piece in a pose and an island, and the greatest overlap with one of its
-    /// pieces in squared piece scales; `None` where they hardly touch.
-    fn misfit(&self, piece: usize, island: usize, pose: &Isometry2<f64>) -> Option<(f64, f64)> {
+    /// How badly a piece fits in a pose; `None` where it hardly touches anything.
+    fn misfit(&self, piece: usize, place: Place, pose: &Isometry2<f64>) -> Option<Misfit> {
         let outline = self.outlines[piece];
         let stride = ((outline.scale * COARSE / outline.spacing) as usize).max(1);
         let (near, cap) = (NEAR * self.scale, CAP * self.scale);
         let around: Vec<(usize, Isometry2<f64>)> =
-            self.around(piece, island, pose).into_iter().map(|q| (q, self.state.pose[q].inverse() * pose)).collect();
-        let gap = |p: &Point| {
-            let gaps = around.iter().filter_map(|(q, q_from_piece)| self.outlines[*q].gap(q_from_piece * p, near));
-            gaps.min_by(|a, b| a.abs().total_cmp(&b.abs()))
+            self.around(piece, place, pose).into_iter().map(|q| (q, self.state.pose[q].inverse() * pose)).collect();
+        let touch = |(p, own): (&Point, &Vector2<f32>)| {
+            let gaps = around.iter().filter_map(|(q, q_from_piece)| {
+                let (gap, normal) = self.outlines[*q].gap(q_from_piece * p, near)?;
+                Some((gap, q_from_piece.rotation.inverse() * normal))
+            });
+            let (gap, normal) = gaps.min_by(|a, b| a.0.abs().total_cmp(&b.0.abs()))?;
+            let follows = normal.dot(&own.cast::<f64>()) < TURNED;
+            // Where it runs inside another piece it doesn't follow, but it is no corner either.
+            (follows || gap < 0.0).then(|| Touch { at: p - outline.centroid, normal, gap: gap - self.prior.mean })
         };
-        let gaps: Vec<f64> = outline.points.iter().step_by(stride).filter_map(gap).collect();
-        if (gaps.len() as f64) < LEAST_SHARE * outline.points.len().div_ceil(stride) as f64 {
+        let touches: Vec<Touch> =
+            outline.points.iter().zip(&outline.normals).step_by(stride).filter_map(touch).collect();
+        let share = touches.len() as f64 / outline.points.len().div_ceil(stride) as f64;
+        if share < LEAST_SHARE {
             return None;
         }
-        let mut gaps: Vec<f64> = gaps.into_iter().map(|g| (g - self.prior.mean).abs().min(cap)).collect();
+        let mut gaps: Vec<f64> = unstrained(&touches).into_iter().map(|g| g.abs().min(cap)).collect();
         gaps.sort_by(f64::total_cmp);
         gaps.truncate((FOLLOWS * gaps.len() as f64).ceil() as usize);
         let sum: f64 = gaps.iter().sum();
-        let worst = around
+        let overlap = around
             .iter()
             .map(|(q, q_from_piece)| {
                 let other = self.outlines[*q];
                 self.memory.overlap(outline, other, q_from_piece) / (outline.scale * other.scale)
             })
             .fold(0.0, f64::max);
-        Some(((sum / gaps.len() as f64).max(1e-4).ln(), worst))
+        Some(Misfit { cost: (sum / gaps.len() as f64).max(1e-4).ln(), share, overlap })
     }
 
-    /// How badly pieces fit that are placed, and how badly strangers do in the places that are free; `None` where there
-    /// is nothing to try or nothing to learn from.
-    fn fitting(&self, trials: &[Trial]) -> Option<Fitting> {
-        /// Fewer placed pieces don't show how well they fit.
-        const FEW: usize = 4;
+    /// How badly pieces fit that are placed, and how badly strangers in their places; `None` where nothing is left over,
+    /// or there is nothing to learn from.
+    fn fitting(&self) -> Option<Fitting> {
         /// Nine tenths of a normal distribution lie below its mean and this many deviations.
         const NORMAL_90: f64 = 1.2816;
-        /// Strangers fit worse by this much (natural logarithm) if none can be tried.
+        /// Strangers fit worse by this much (natural logarithm) if all overlap.
         const STRANGE: f64 = 1.0;
-        if trials.is_empty() {
+        let placed: Vec<usize> = (0..self.outlines.len()).filter(|k| self.state.size(*k) > FEW).collect();
+        if placed.len() == self.outlines.len() {
             return None;
         }
-        let placed: Vec<usize> = (0..self.outlines.len()).filter(|k| self.state.size(*k) > FEW).collect();
         let sample: Vec<usize> = placed.iter().copied().step_by(placed.len().div_ceil(SAMPLE).max(1)).collect();
-        let costs = |k: &usize| self.misfit(*k, self.state.island(*k), &self.state.pose[*k]).map(|(cost, _)| cost);
-        let mut right: Vec<f64> = sample.par_iter().filter_map(costs).collect();
+        let cost = |k: &usize| Some(self.misfit(*k, (self.state.island(*k), None), &self.state.pose[*k])?.cost);
+        let mut right: Vec<f64> = sample.par_iter().filter_map(cost).collect();
         if right.len() < FEW {
             return None;
         }
@@ -226,26 +315,27 @@ impl Assembler<'_> {
         let upper = (right[right.len() * 9 / 10] - right[right.len() / 2]) / NORMAL_90;
         let (middle, deviation) = spread_of(&mut right);
         let right = (middle, deviation.max(upper));
-        // Pieces that belong elsewhere, where candidates would put them among the gaps.
-        let strangers: Vec<(usize, usize)> = (0..self.edges.len())
-            .filter(|k| {
-                let e = &self.edges[*k];
-                [e.a, e.b].iter().all(|p| self.state.size(*p) > FEW)
+        // Every other candidate of an isthmus that has a mating leads a stranger to the place of the piece there.
+        let instead = |k: &usize| {
+            let ends = self.edges[*k].slots();
+            [(ends[0], ends[1].piece), (ends[1], ends[0].piece)].into_iter().flat_map(move |(held, piece)| {
+                let others = self.at[held.piece].iter().filter_map(move |j| {
+                    let [tab, mouth] = self.edges[*j].slots();
+                    let stranger = if tab == held { mouth.piece } else { tab.piece };
+                    ((tab == held || mouth == held) && stranger != piece).then_some((*j, stranger, piece))
+                });
+                others.filter(|(_, stranger, _)| !self.aside[*stranger])
             })
-            .flat_map(|k| self.edges[k].slots().map(|s| (k, s)))
-            .filter(|(k, held)| self.open(*held, *k))
-            .map(|(k, held)| (k, self.edges[k].slots().into_iter().find(|s| *s != held).map_or(0, |s| s.piece)))
-            .filter(|(k, piece)| !(self.aside[*piece] || self.same_island(*k) && self.agrees(*k)))
-            .take(STRANGERS)
-            .collect();
-        let elsewhere = |t: &Trial| {
-            t.island != self.state.island(t.piece)
-                || (t.centre - self.centre_of(t.piece)).norm() > SAME_PLACE * self.scale
         };
-        let tried = strangers.par_iter().filter_map(|(k, piece)| self.trial(*k, *piece)).filter(elsewhere);
-        let mut wrong: Vec<f64> = tried.map(|t| t.cost).collect();
-        let rarity = ((strangers.len() + 1) as f64 / (wrong.len() + 1) as f64).ln();
+        let large = self.state.joined().iter().filter(|k| self.state.size(self.edges[**k].a) > FEW);
+        let exchanges: Vec<(usize, usize, usize)> = large.flat_map(instead).collect();
+        let some: Vec<_> = exchanges.iter().step_by(exchanges.len().div_ceil(STRANGERS).max(1)).collect();
+        let tried = some.par_iter().filter_map(|(k, stranger, piece)| self.trial(*k, *stranger, Some(*piece)));
+        let tried: Vec<Misfit> = tried.map(|t| t.misfit).collect();
+        let mut strangers: Vec<(f64, bool)> = tried.iter().map(|m| (m.share, m.overlap <= self.tolerated())).collect();
+        strangers.sort_by(|p, q| p.0.total_cmp(&q.0).then(p.1.cmp(&q.1)));
+        let mut wrong: Vec<f64> = tried.iter().filter(|m| m.overlap <= self.tolerated()).map(|m| m.cost).collect();
         let wrong = if wrong.len() < FEW { (right.0 + STRANGE, right.1) } else { spread_of(&mut wrong) };
-        Some(Fitting { model: Model::between(right, wrong), rarity })
+        Some(Fitting { model: Model::between(right, wrong), strangers })
     }
 }
