@@ -12,13 +12,15 @@ use jigsaw::generate::{Options, Puzzle};
 use jigsaw_msgs::msg::Assembly;
 use jigsaw_msgs::tf2_msgs::msg::TFMessage;
 use jigsaw_nodes::ros::topics::{self, Topic};
+use nix::sys::signal::Signal;
+use nix::sys::wait::{WaitPidFlag, WaitStatus, waitpid};
 use ros2_client::{Context, MessageTypeName, Name, Node, NodeName, NodeOptions};
 
 /// What may pass before a test counts as hung. Generous: the machine may be busy with other tests.
 const PATIENCE: Duration = Duration::from_secs(120);
 
-/// How long a node may take to end after a signal.
-const END: Duration = Duration::from_secs(1);
+/// How long a stopped node is left to find out that it is deaf before it is stopped once more.
+const DEAF: Duration = Duration::from_secs(3);
 
 /// A domain for each test of this file, so that tests that run side by side don't see one another.
 fn domain(test: u16) -> u16 {
@@ -74,22 +76,33 @@ impl Process {
         Self(child)
     }
 
-    fn signal(&self, signal: nix::sys::signal::Signal) {
+    fn signal(&self, signal: Signal) {
         nix::sys::signal::kill(nix::unistd::Pid::from_raw(self.0.id() as i32), signal).unwrap();
     }
 
-    /// Waits for the end; the exit status and what was said on standard error.
-    fn end(mut self, patience: Duration) -> (ExitStatus, String) {
+    fn wait_until_stopped(&self) {
+        let pid = nix::unistd::Pid::from_raw(self.0.id() as i32);
+        let stopped = waitpid(pid, Some(WaitPidFlag::WUNTRACED)).unwrap();
+        assert!(matches!(stopped, WaitStatus::Stopped(..)), "{stopped:?}");
+    }
+
+    fn ends_within(&mut self, patience: Duration) -> bool {
         let deadline = Instant::now() + patience;
-        while Instant::now() < deadline {
-            if let Some(status) = self.0.try_wait().unwrap() {
-                let mut said = String::new();
-                self.0.stderr.take().unwrap().read_to_string(&mut said).unwrap();
-                return (status, said);
+        while self.0.try_wait().unwrap().is_none() {
+            if Instant::now() > deadline {
+                return false;
             }
             std::thread::sleep(Duration::from_millis(5));
         }
-        panic!("the process did not end within {patience:?}");
+        true
+    }
+
+    /// Waits for the end; the exit status and what was said on standard error.
+    fn end(mut self) -> (ExitStatus, String) {
+        assert!(self.ends_within(PATIENCE), "the process did not end within {PATIENCE:?}");
+        let mut said = String::new();
+        self.0.stderr.take().unwrap().read_to_string(&mut said).unwrap();
+        (self.0.wait().unwrap(), said)
     }
 }
 
@@ -180,8 +193,8 @@ fn three_processes_assemble_a_folder_and_end_in_order() {
         assert!(piece.goal.position.x > 0.0 && piece.goal.position.y > 0.0);
     }
     for node in nodes {
-        node.signal(nix::sys::signal::Signal::SIGTERM);
-        let (status, said) = node.end(END);
+        node.signal(Signal::SIGTERM);
+        let (status, said) = node.end();
         assert_eq!(status.code(), Some(0), "{said}");
     }
 }
@@ -201,7 +214,7 @@ fn bad_input_ends_with_one_line_and_code_2() {
         (solver, &["positional"], "unknown argument 'positional'"),
     ];
     for (binary, args, wanted) in cases {
-        let (status, said) = Process::start(binary, domain(1), args).end(PATIENCE);
+        let (status, said) = Process::start(binary, domain(1), args).end();
         assert_eq!(status.code(), Some(2), "{args:?}: {said}");
         assert!(said.contains(wanted) && said.trim_end().lines().count() == 1, "{args:?}: {said}");
     }
@@ -210,13 +223,19 @@ fn bad_input_ends_with_one_line_and_code_2() {
 #[test]
 fn a_node_whose_middleware_died_ends_with_code_3() {
     let domain = domain(2);
-    let node = Process::start(env!("CARGO_BIN_EXE_solver_node"), domain, &[]);
-    // The latched diagnostics tell that it is up.
+    let mut node = Process::start(env!("CARGO_BIN_EXE_solver_node"), domain, &[]);
+    // The diagnostics tell that it is up.
     Listener::new(domain).wait(&topics::DIAGNOSTICS, |_| true);
-    node.signal(nix::sys::signal::Signal::SIGSTOP);
-    std::thread::sleep(Duration::from_millis(200));
-    node.signal(nix::sys::signal::Signal::SIGCONT);
-    let (status, said) = node.end(Duration::from_secs(3));
+    // None of the middleware's threads may have been waiting: then the node is well, and is stopped once more.
+    for _ in 0..10 {
+        node.signal(Signal::SIGSTOP);
+        node.wait_until_stopped();
+        node.signal(Signal::SIGCONT);
+        if node.ends_within(DEAF) {
+            break;
+        }
+    }
+    let (status, said) = node.end();
     assert_eq!(status.code(), Some(3), "{said}");
     assert!(said.contains("gone deaf"), "{said}");
 }
@@ -231,7 +250,7 @@ fn a_composed_cell_gives_the_same_assembly() {
     let mut listener = Listener::in_namespace(domain, "/cell");
     let assembly = listener.wait(&topics::ASSEMBLY, |assembly| assembly.pieces.len() == 6 && complete(assembly));
     assert!(assembly.unplaced.is_empty());
-    cell.signal(nix::sys::signal::Signal::SIGINT);
-    let (status, said) = cell.end(END);
+    cell.signal(Signal::SIGINT);
+    let (status, said) = cell.end();
     assert_eq!(status.code(), Some(0), "{said}");
 }

@@ -105,6 +105,7 @@ if [ "$(cat "$venv/messages.stamp" 2>/dev/null)" != "$messages_stamp" ]; then
     export _ROS_WHEELS_BOOTSTRAP_COMPLETE=1
     for package in "$tf2" "$root/msgs"; do
         name=$(sed -n 's#.*<name>\(.*\)</name>.*#\1#p' "$package/package.xml")
+        rm -rf "${work:?}/$name" # a folder that was moved or half built is of no use to CMake
         # Quick to build is worth more here than quick to run.
         quietly "configuring $name" cmake -G Ninja -S "$package" -B "$work/$name" -DCMAKE_BUILD_TYPE=None \
             -DCMAKE_C_FLAGS=-O0 -DCMAKE_CXX_FLAGS=-O0 -DBUILD_TESTING=OFF \

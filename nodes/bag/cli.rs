@@ -1,6 +1,6 @@
 //! `jigsaw bag info | play | record`.
 
-use std::cell::{Cell, RefCell};
+use std::cell::Cell;
 use std::io::Write;
 use std::path::PathBuf;
 use std::process::ExitCode;
@@ -356,34 +356,31 @@ fn run_record(args: RecordArgs) -> ExitCode {
         },
         compression: if args.uncompressed { Compression::None } else { Compression::Zstd },
     };
-    let bag = match BagWriter::create(&args.bag, writer_options) {
-        Ok(bag) => Rc::new(RefCell::new(bag)),
+    let mut bag = match BagWriter::create(&args.bag, writer_options) {
+        Ok(bag) => bag,
         Err(error) => return bad_input(error),
     };
     let code = Rc::new(Cell::new(ExitCode::SUCCESS));
-    let (outcome, recording) = (Rc::clone(&code), Rc::clone(&bag));
+    let outcome = Rc::clone(&code);
     let result = process.run(move |process| {
         let mut session = process.node("bag_recorder", &[])?;
+        let end = process.ending();
         Ok(Box::pin(async move {
             let spinner = ProgressBar::new_spinner();
-            if let Err(error) = record(&mut session, &recording, &options, |event| show_record(&spinner, event)).await {
+            if let Err(error) =
+                record(&mut session, &mut bag, &options, end, |event| show_record(&spinner, event)).await
+            {
                 outcome.set(bad_input(error));
             }
             spinner.finish_and_clear();
-            Ok(())
-        }))
-    });
-    // The work is gone with the process, so the bag is ours alone again, whether it ended by itself or by a signal.
-    match Rc::try_unwrap(bag).map(RefCell::into_inner) {
-        Ok(bag) => {
             let count = bag.message_count();
             match bag.finish() {
                 Ok(()) => println!("{count} messages recorded in {}", args.bag.display()),
-                Err(error) => return bad_input(error),
+                Err(error) => outcome.set(bad_input(error)),
             }
-        }
-        Err(_) => return bad_input("the bag is still in use; it is left without metadata.yaml"),
-    }
+            Ok(())
+        }))
+    });
     match result {
         Ok(()) => code.get(),
         Err(error) => exit_code("jigsaw bag record", Err(error)),

@@ -6,13 +6,12 @@
 //!
 //! The bag can be read at any moment: it is flushed every second.
 
-use std::cell::RefCell;
 use std::collections::{BTreeMap, BTreeSet};
-use std::rc::Rc;
+use std::pin::pin;
 use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 
-use futures::StreamExt;
 use futures::stream::SelectAll;
+use futures::{FutureExt, StreamExt};
 use thiserror::Error;
 
 use super::qos::{Durability, History, QosProfile, Reliability};
@@ -28,6 +27,10 @@ const FLUSH_PERIOD: Duration = Duration::from_secs(1);
 
 /// How long a topic of a given type may stay without a publisher before it is subscribed all the same.
 const DISCOVERY: Duration = Duration::from_secs(1);
+
+/// How often in turn those who bring the messages may have had nothing before all that was received counts as recorded:
+/// each yields to all others, so once would do; a few times costs nothing.
+const IDLE_TURNS: usize = 10;
 
 /// Samples the middleware may hold while the disk is slow.
 const DEPTH: usize = 256;
@@ -80,17 +83,19 @@ pub enum RecordEvent {
     Recorded(u64),
 }
 
-/// Records into `bag` until the duration or the number of messages is reached; drop the future to end it earlier. The
-/// bag stays with the caller, who finishes it either way.
+/// Records into `bag` until the duration or the number of messages is reached, or `end` has come; then what has been
+/// received by then, and so was acknowledged, is still recorded. The bag stays with the caller, who finishes it.
 ///
 /// # Errors
 /// [`RecordError`].
 pub async fn record(
     session: &mut Session,
-    bag: &Rc<RefCell<BagWriter>>,
+    bag: &mut BagWriter,
     options: &RecordOptions,
+    end: impl Future<Output = ()>,
     mut tell: impl FnMut(RecordEvent),
 ) -> Result<(), RecordError> {
+    let mut end = pin!(end.fuse());
     let begun = Instant::now();
     let mut known = Subscriptions::default();
     let mut messages = SelectAll::new();
@@ -110,12 +115,12 @@ pub async fn record(
         }
         futures::select! {
             message = messages.next() => {
-                let Some((id, RawSample { cdr, source_time_ns })) = message else { continue };
-                let now = now_ns();
-                bag.borrow_mut().write(id, now, source_time_ns.unwrap_or(now), &cdr)?;
+                let Some(message) = message else { continue };
+                write(bag, message)?;
                 recorded += 1;
                 tell(RecordEvent::Recorded(recorded));
             }
+            () = end => break,
             _ = look.next() => {
                 for found in known.due(session.remote_publishers(), options, begun.elapsed(), &mut tell) {
                     let Found { topic, qos } = found;
@@ -127,16 +132,37 @@ pub async fn record(
                         )));
                     }
                     tell(RecordEvent::Subscribed { topic: topic.name.clone(), type_name: topic.type_name.clone() });
-                    let id: TopicId = bag.borrow_mut().add_topic(topic)?;
+                    let id: TopicId = bag.add_topic(topic)?;
                     messages.push(stream.map(move |sample| (id, sample)));
                 }
                 if flushed.elapsed() >= FLUSH_PERIOD {
-                    bag.borrow_mut().flush()?;
+                    bag.flush()?;
                     flushed = Instant::now();
                 }
             }
         }
     }
+    let mut idle = 0;
+    while idle < IDLE_TURNS && options.max_messages.is_none_or(|most| recorded < most) {
+        match messages.next().now_or_never().flatten() {
+            Some(message) => {
+                write(bag, message)?;
+                recorded += 1;
+                idle = 0;
+            }
+            None => {
+                smol::future::yield_now().await;
+                idle += 1;
+            }
+        }
+    }
+    tell(RecordEvent::Recorded(recorded));
+    Ok(())
+}
+
+fn write(bag: &mut BagWriter, (topic, sample): (TopicId, RawSample)) -> Result<(), BagError> {
+    let now = now_ns();
+    bag.write(topic, now, sample.source_time_ns.unwrap_or(now), &sample.cdr)
 }
 
 fn now_ns() -> i64 {

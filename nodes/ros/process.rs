@@ -19,6 +19,7 @@ use std::rc::Rc;
 use std::sync::Arc;
 use std::time::Duration;
 
+use futures::channel::oneshot;
 use futures::future::LocalBoxFuture;
 use futures::{FutureExt, SinkExt, StreamExt};
 use jigsaw_msgs::builtin_interfaces::msg::Time;
@@ -211,6 +212,8 @@ pub struct Process {
     participant: Option<(DomainParticipant, Context)>,
     /// Held until the endpoints are open.
     turn: Option<Turn>,
+    /// Where the work is told that a signal has come, if it wants to end itself.
+    ending: Option<oneshot::Sender<()>>,
     /// The parameters of all nodes of a composed process: one that another node has is no mistake.
     tables: &'static [&'static [Spec]],
 }
@@ -233,6 +236,7 @@ impl Process {
             endpoints: Endpoints::default(),
             participant: None,
             turn: None,
+            ending: None,
             tables: &[],
         })
     }
@@ -295,16 +299,31 @@ impl Process {
         Ok(session)
     }
 
+    /// What resolves when a signal has come, for work that has something to bring to its end then: the first signal does
+    /// not drop it, and the process waits for it; a second one ends the process as the first one does otherwise.
+    pub fn ending(&mut self) -> impl Future<Output = ()> + use<> {
+        let (sender, told) = oneshot::channel();
+        self.ending = Some(sender);
+        told.map(drop)
+    }
+
     /// Runs the work that `open` makes until it is done, a signal comes or the middleware dies.
     ///
     /// # Errors
     /// What went wrong while opening or running.
     pub fn run(mut self, open: impl FnOnce(&mut Self) -> Result<Work, ProcessError>) -> Result<(), ProcessError> {
         let work = open(&mut self)?;
-        let (signal, signalled) = futures::channel::oneshot::channel();
+        let (signal, signalled) = oneshot::channel();
+        let ending = self.ending.take();
         std::thread::Builder::new()
             .name("signals".to_owned())
             .spawn(move || {
+                if let Some(ending) = ending
+                    && let Ok(received) = signals().wait()
+                {
+                    log::info!("{received}: ending");
+                    let _ = ending.send(());
+                }
                 if let Ok(received) = signals().wait() {
                     log::info!("{received}: ending");
                     let _ = signal.send(());

@@ -173,10 +173,20 @@ fn descendant_of(ancestor: u32, name: &str) -> Option<i32> {
     candidates.into_iter().find(descends).map(|pid| pid as i32)
 }
 
+/// The state of a process, as the system's table has it.
+fn state(pid: i32) -> Option<char> {
+    let stat = std::fs::read_to_string(format!("/proc/{pid}/stat")).ok()?;
+    stat.rsplit_once(") ").and_then(|(_, tail)| tail.chars().next())
+}
+
 /// Whether a process still runs.
 pub(crate) fn runs(pid: i32) -> bool {
-    std::fs::read_to_string(format!("/proc/{pid}/stat"))
-        .is_ok_and(|stat| stat.rsplit_once(") ").is_some_and(|(_, tail)| !tail.starts_with('Z')))
+    state(pid).is_some_and(|state| state != 'Z')
+}
+
+/// Whether a process has been stopped.
+pub(crate) fn is_stopped(pid: i32) -> bool {
+    state(pid) == Some('T')
 }
 
 /// What the cell has said so far.

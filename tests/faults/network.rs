@@ -216,7 +216,8 @@ fn solve_without(lost: Signal, test: u8, orders: &[&str], is_static: bool) {
     let peers = [CAPTURE, FEATURE, SOLVER, HERE].map(|host| network.address(host).to_string()).join(";");
     let environment = if is_static { vec![("ROS_STATIC_PEERS", peers)] } else { Vec::new() };
     let spread = Spread::start(&network, &folder.0, domain(test.into()), &environment);
-    let _camera = spread.play(&network, &["--loop", "--rate", "1"]);
+    // Slowly: when the two are seen to share, there must be pieces left to take over.
+    let _camera = spread.play(&network, &["--loop", "--rate", "0.4"]);
     spread.shared();
     let pid = spread.features[1].pid("feature_node");
     assert!(signal(pid, lost));

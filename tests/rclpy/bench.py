@@ -3,12 +3,15 @@ each piece lies and where it goes. Both are plain rclpy nodes that know the cont
 
 import cmath
 import io
+import math
 from dataclasses import dataclass
 
 import numpy
 from builtin_interfaces.msg import Time
+from diagnostic_msgs.msg import DiagnosticArray
 from jigsaw_msgs.msg import Assembly, PieceFeatures
 from PIL import Image as Picture
+from rcl_interfaces.msg import Log, ParameterEvent
 from rclpy.qos import QoSDurabilityPolicy, QoSProfile, QoSReliabilityPolicy
 from sensor_msgs.msg import CompressedImage, Image
 from tf2_msgs.msg import TFMessage
@@ -18,6 +21,8 @@ METRES_PER_PIXEL = 0.00025  # not the default, so that a forgotten scale shows
 POSITION_TOLERANCE_PX = 0.5  # of a piece's goal, after one rigid motion of the whole puzzle
 SIGHTING_TOLERANCE_PX = 1.0  # of a piece's centroid where it lies: the generator's blur and the kerf move it a little
 ANGLE_TOLERANCE = 0.005  # [rad], half a pixel at the rim of a piece
+
+AGAIN = 5.0  # seconds until a frame is shown again of which nothing was heard
 
 LATCHED_PIECES = QoSProfile(
     depth=1000, reliability=QoSReliabilityPolicy.RELIABLE, durability=QoSDurabilityPolicy.TRANSIENT_LOCAL
@@ -56,36 +61,41 @@ def compressed_message(grey, stamp, file_format="png"):
 
 
 class Camera:
-    """Publishes each frame with a stamp of its own until the cell has told of it: best effort may lose one."""
+    """Publishes each frame with a stamp of its own until the cell has told of it, as best effort may lose one;
+    compressed frames, which are reliable, once."""
 
     def __init__(self, ros, topic="image", compressed=False, features="pieces/features"):
         self.ros = ros
         self.node = ros.node("camera")
+        self.compressed = compressed
         if compressed:
             self.publisher = self.node.create_publisher(CompressedImage, topic, RELIABLE)
         else:
             self.publisher = self.node.create_publisher(Image, topic, BEST_EFFORT)
         self.features = {}  # by the stamp's seconds
-        self.sent = 0
         self.node.create_subscription(PieceFeatures, features, self.take, LATCHED_PIECES)
 
     def take(self, features):
         self.features.setdefault(features.header.stamp.sec, []).append(features)
 
-    def show(self, message, attempts=5, seen=None):
+    def listened_to(self):
+        """Waits until the capture node listens: to compressed frames with two subscriptions, one of them reliable."""
+        wanted = 2 if self.compressed else 1
+        self.ros.until(
+            lambda: self.publisher.get_subscription_count() >= wanted, f"listener on {self.publisher.topic_name}"
+        )
+
+    def show(self, message, seen=None):
         """Publishes until the features of the frame come back (or `seen` gives something true); gives them."""
         second = message.header.stamp.sec
         seen = seen or (lambda: self.features.get(second))
-        self.ros.until(lambda: self.publisher.get_subscription_count() > 0, f"listener on {self.publisher.topic_name}")
-        for attempt in range(attempts):
-            self.publisher.publish(message)
-            self.sent += 1
-            last = attempt == attempts - 1
-            if evidence := self.ros.until(seen, f"sign of frame {second}", 5, required=last):
-                return evidence
+        self.listened_to()
+        period = math.inf if self.compressed else AGAIN
+        return self.ros.until_repeated(lambda: self.publisher.publish(message), seen, f"sign of frame {second}", period)
 
-    def show_puzzle(self, puzzle, make=image_message, **options):
-        """Shows every frame; gives the truth of each piece by the id that the cell gave it."""
+    def show_puzzle(self, puzzle, make=image_message, arm=None, **options):
+        """Shows every frame; gives the truth of each piece by the id that the cell gave it. Where an arm is given, it
+        has heard of each piece before the next one is shown."""
         truth = {}
         for piece, grey, stamp in stamped_frames(puzzle):
             features = self.show(make(grey, stamp, **options))
@@ -93,6 +103,9 @@ class Camera:
             assert features[0].header.frame_id == "camera"
             assert features[0].header.stamp.nanosec == stamp.nanosec
             truth[features[0].id] = TruePiece(piece, grey.shape[1], grey.shape[0])
+            if arm:
+                name = features[0].id
+                self.ros.until(lambda name=name: arm.knows(name), f"assembly that knows {name}")
         return truth
 
     def show_puzzle_to_composed_cell(self, puzzle, arm):
@@ -147,6 +160,41 @@ def planar(transform_or_pose):
     assert position.z == 0 and rotation.x == 0 and rotation.y == 0
     assert abs(rotation.z**2 + rotation.w**2 - 1) < 1e-9
     return complex(position.x, position.y), complex(rotation.w, rotation.z) ** 2
+
+
+class Monitor:
+    """The latest status of every node, and all log lines."""
+
+    def __init__(self, ros):
+        self.ros = ros
+        self.node = ros.node("monitor")
+        self.latest, self.stamps, self.lines, self.events = {}, {}, [], []
+        self.node.create_subscription(DiagnosticArray, "/diagnostics", self.take, 10)
+        self.node.create_subscription(Log, "/rosout", self.lines.append, LATCHED_PIECES)
+        self.node.create_subscription(ParameterEvent, "/parameter_events", self.events.append, 10)
+
+    def take(self, array):
+        for status in array.status:
+            self.latest[status.name] = status
+            self.stamps.setdefault(status.name, []).append(array.header.stamp)
+
+    def values(self, name):
+        """The latest values of a node, by their keys."""
+        status = self.latest.get(name)
+        return {value.key: value.value for value in status.values} if status else {}
+
+    def status(self, name, condition=lambda status, values: True):
+        """Waits for a status for which the condition holds; gives it and its values."""
+
+        def found():
+            values = self.values(name)
+            return (self.latest[name], values) if values and condition(self.latest[name], values) else None
+
+        return self.ros.until(found, f"status of {name}")
+
+    def refused(self, name, kind):
+        """How many inputs of this kind a node says to have refused."""
+        return int(self.values(name).get(f"refused.{kind}", "0"))
 
 
 class Arm:

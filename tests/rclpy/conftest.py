@@ -5,6 +5,7 @@ Nothing here sleeps: a test waits for an event, and a time limit turns a missing
 """
 
 import json
+import math
 import os
 import random
 import shutil
@@ -30,8 +31,9 @@ import rclpy
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.qos import QoSDurabilityPolicy, QoSProfile, QoSReliabilityPolicy
 
-EVENT_TIMEOUT = 30.0  # seconds until an awaited event counts as missing; on an idle machine all come within 2
-EXIT_TIMEOUT = 10.0  # seconds that a process may take to end after SIGTERM
+EVENT_TIMEOUT = 60.0  # seconds until an awaited event counts as missing; on an idle machine all come within 2
+EXIT_TIMEOUT = 30.0  # seconds that a process may take to end after SIGTERM; it takes at most 1 on an idle machine
+REPEAT = 1.0  # seconds until something is done again whose effect has not shown
 
 LATCHED = QoSProfile(depth=1, reliability=QoSReliabilityPolicy.RELIABLE, durability=QoSDurabilityPolicy.TRANSIENT_LOCAL)
 
@@ -195,6 +197,22 @@ class Harness:
                 pytest.fail(f"after {timeout} s still no {what}")
             self.executor.spin_once(timeout_sec=0.05)
         return result
+
+    def until_repeated(self, action, condition, what, period=REPEAT):
+        """As `until`, doing something first and then again from time to time: a best-effort message may be lost, and
+        what is not latched does not reach those who have not met yet."""
+        due = -math.inf
+
+        def shown():
+            nonlocal due
+            if result := condition():
+                return result
+            if (now := time.monotonic()) >= due:
+                action()
+                due = now + period
+            return None
+
+        return self.until(shown, what)
 
     def adopt(self, node):
         """Spins a node that was made elsewhere, in this context."""

@@ -64,9 +64,7 @@ def test_all_that_starts_together_is_seen(launcher, domain, start):
     harness = Harness(domain)
     try:
         node = harness.node("looker")
-        seen = harness.until(
-            lambda: not any(missing(node, name) for name in PUBLISHED), "whole graph", timeout=15, required=False
-        )
+        seen = harness.until(lambda: not any(missing(node, name) for name in PUBLISHED), "whole graph", required=False)
         assert seen, {name: sorted(missing(node, name)) for name in PUBLISHED}
     finally:
         harness.close()

@@ -5,44 +5,18 @@ import time
 
 import pytest
 from builtin_interfaces.msg import Time
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
-from rcl_interfaces.msg import Log, Parameter, ParameterEvent, ParameterType, ParameterValue
+from diagnostic_msgs.msg import DiagnosticStatus
+from rcl_interfaces.msg import Log, Parameter, ParameterType, ParameterValue
 from rcl_interfaces.srv import SetParameters
-from rclpy.qos import QoSProfile
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import Image
 from std_srvs.srv import Trigger
 
-from bench import BEST_EFFORT, METRES_PER_PIXEL, Arm, Camera, image_message, stamped_frames
+from bench import BEST_EFFORT, METRES_PER_PIXEL, Arm, Camera, Monitor, image_message, stamped_frames
 
 NODES = ("capture_node", "feature_node", "solver_node")
 FLOOD = 50  # refused frames, sent as fast as they go
 THROTTLE = 5.0  # seconds between two lines of a kind
-
-
-class Monitor:
-    """The latest status of every node, and all log lines."""
-
-    def __init__(self, ros):
-        self.ros = ros
-        self.node = ros.node("monitor")
-        self.latest, self.stamps, self.lines, self.events = {}, {}, [], []
-        self.node.create_subscription(DiagnosticArray, "/diagnostics", self.take, 10)
-        self.node.create_subscription(Log, "/rosout", self.lines.append, QoSProfile(depth=1000))
-        self.node.create_subscription(ParameterEvent, "/parameter_events", self.events.append, 10)
-
-    def take(self, array):
-        for status in array.status:
-            self.latest[status.name] = status
-            self.stamps.setdefault(status.name, []).append(array.header.stamp)
-
-    def status(self, name, condition=lambda status, values: True):
-        def found():
-            status = self.latest.get(name)
-            values = {value.key: value.value for value in status.values} if status else {}
-            return (status, values) if status and condition(status, values) else None
-
-        return self.ros.until(found, f"status of {name}")
 
 
 def test_diagnostics_in_the_standard_form(launcher, ros, generate):
@@ -68,9 +42,12 @@ def test_a_flood_of_refusals_is_one_line_and_a_count(launcher, ros):
     monitor.status("capture_node")
     bad = Image(width=8, height=8, step=3, encoding="mono8", data=bytes(64))
     begun = time.monotonic()
-    for _ in range(FLOOD):
-        camera.publish(bad)
-    status, values = monitor.status("capture_node", lambda status, values: int(values["refused"]) >= FLOOD // 2)
+    ros.until_repeated(
+        lambda: [camera.publish(bad) for _ in range(FLOOD)],
+        lambda: int(monitor.values("capture_node")["refused"]) >= FLOOD,
+        f"{FLOOD} refusals",
+    )
+    status, values = monitor.status("capture_node")
     assert status.level == DiagnosticStatus.WARN and "step 3" in status.message
     assert values["refused.step"] == values["refused"] and "step 3" in values["last_error"]
     warnings = ros.until(lambda: [line for line in monitor.lines if "step 3" in line.msg], "line on /rosout")
@@ -91,9 +68,14 @@ def test_changes_of_parameters_are_told_and_refusals_counted(launcher, ros):
     monitor = Monitor(ros)
     monitor.status("solver_node")
     whole = {"type": ParameterType.PARAMETER_INTEGER}
-    assert set_parameter(ros, monitor.node, "solver_node", "expected_pieces", integer_value=24, **whole).successful
-    event = ros.until(lambda: [e for e in monitor.events if e.node == "/solver_node"], "event")[-1]
-    (changed,) = event.changed_parameters
+
+    def change():
+        assert set_parameter(ros, monitor.node, "solver_node", "expected_pieces", integer_value=24, **whole).successful
+
+    def told():
+        return [e for e in monitor.events if e.node == "/solver_node" and e.changed_parameters]
+
+    (changed,) = ros.until_repeated(change, told, "event of the change")[-1].changed_parameters
     assert (changed.name, changed.value.integer_value) == ("expected_pieces", 24)
     assert not set_parameter(ros, monitor.node, "solver_node", "expected_pieces", integer_value=-1, **whole).successful
     monitor.status("solver_node", lambda status, values: values.get("refused.parameter") == "1")
@@ -155,8 +137,8 @@ def test_time_comes_from_the_clock_under_use_sim_time(launcher, ros, name):
         return shown in monitor.stamps.get(name, [])
 
     ros.until(ticked, "stamp of the clock")
-    clock.publish(Clock(clock=Time(sec=-1, nanosec=4_000_000_000)))
-    monitor.status(name, lambda status, values: values.get("refused.clock") == "1")
+    bad = Clock(clock=Time(sec=-1, nanosec=4_000_000_000))
+    ros.until_repeated(lambda: clock.publish(bad), lambda: monitor.refused(name, "clock"), "refusal of a time")
     assert all(stamp in (Time(), shown) for stamp in monitor.stamps[name])
     off = {"type": ParameterType.PARAMETER_BOOL, "bool_value": False}
     assert set_parameter(ros, monitor.node, name, "use_sim_time", **off).successful

@@ -13,9 +13,18 @@ from jigsaw_msgs.msg import PieceFeatures, PieceImage
 from PIL import Image as Picture
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import CompressedImage, Image
-from test_health import Monitor
 
-from bench import BEST_EFFORT, LATCHED_PIECES, METRES_PER_PIXEL, RELIABLE, Arm, Camera, check_assembly, image_message
+from bench import (
+    BEST_EFFORT,
+    LATCHED_PIECES,
+    METRES_PER_PIXEL,
+    RELIABLE,
+    Arm,
+    Camera,
+    Monitor,
+    check_assembly,
+    image_message,
+)
 
 SCALE = ("-p", f"capture_node:metres_per_pixel:={METRES_PER_PIXEL}")
 FLOOD_SECONDS = float(os.environ.get("JIGSAW_FLOOD_SECONDS", "5"))  # the long run takes 60
@@ -127,19 +136,14 @@ def cell(launcher, ros, generate):
 def refused(ros, cell, node, publisher, good, cases):
     """Publishes each case until it is counted under its kind; nothing else is counted."""
     for path, value, kind in cases:
-        key = f"refused.{kind}"
-
-        def count(key=key):
-            status = cell.monitor.latest.get(node)
-            return int({v.key: v.value for v in status.values}.get(key, "0")) if status else 0
-
-        before = count()
+        before = cell.monitor.refused(node, kind)
         bad = with_field(good, path, value)
-        for _ in range(5):  # the first ones may come before discovery
-            publisher.publish(bad)
-            if ros.until(lambda count=count, before=before: count() > before, kind, 2.5, required=False):
-                break
-        assert count() > before, f"{node}: {path} = {value!r:.60} is not counted as {kind}"
+        ros.until_repeated(
+            lambda bad=bad: publisher.publish(bad),
+            lambda kind=kind, before=before: cell.monitor.refused(node, kind) > before,
+            f"count of {path} = {value!r:.60} as {kind} by {node}",
+            2.5,
+        )
         text = next(n for n in cell.nodes if n.name == node).text()
         word = SAID.get(kind, kind.removesuffix(" length").split(",")[0].split(".")[-1])
         assert word in text, f"no line names {word}"
