@@ -1,5 +1,7 @@
 //! `jigsaw bag` as a user runs it: real processes, real DDS over loopback.
 
+mod domain;
+
 use std::io::{BufRead, BufReader};
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Output, Stdio};
@@ -16,15 +18,9 @@ const PATIENCE: Duration = Duration::from_secs(60);
 /// Bytes of a large message: a camera frame as PNG.
 const LARGE: usize = 150_000;
 
-/// DDS domains of the tests, one each, so that they can run side by side.
-fn domain(test: u32) -> String {
-    let first = std::env::var("ROS_DOMAIN_ID").ok().and_then(|id| id.parse::<u32>().ok()).unwrap_or(80);
-    (first + test).to_string()
-}
-
-fn jigsaw(test: u32, args: &[&str]) -> Command {
+fn jigsaw(domain: u16, args: &[&str]) -> Command {
     let mut command = Command::new(env!("CARGO_BIN_EXE_jigsaw"));
-    command.args(args).env("ROS_DOMAIN_ID", domain(test)).env("ROS_LOCALHOST_ONLY", "1");
+    command.args(args).env("ROS_DOMAIN_ID", domain.to_string()).env("ROS_LOCALHOST_ONLY", "1");
     command.stdin(Stdio::null()).stdout(Stdio::piped()).stderr(Stdio::piped());
     command
 }
@@ -139,15 +135,18 @@ fn folder() -> (tempfile::TempDir, PathBuf) {
 
 #[test]
 fn a_bag_played_at_full_speed_is_recorded_byte_for_byte() {
+    let domain = domain::free();
     let (_keep, folder) = folder();
     let (source, copy) = (folder.join("source"), folder.join("copy"));
     let played = write_bag(&source, 40);
     let count = played.len().to_string();
     let (source_text, copy_text) = (source.to_string_lossy(), copy.to_string_lossy());
-    let recorder =
-        jigsaw(1, &["bag", "record", &copy_text, "--topics", "/image/compressed", "/odd", "--max-messages", &count]);
+    let recorder = jigsaw(
+        domain,
+        &["bag", "record", &copy_text, "--topics", "/image/compressed", "/odd", "--max-messages", &count],
+    );
     let recorder = Running::start(recorder);
-    let player = Running::start(jigsaw(1, &["bag", "play", &source_text, "--rate", "0"])).output();
+    let player = Running::start(jigsaw(domain, &["bag", "play", &source_text, "--rate", "0"])).output();
     assert!(player.status.success(), "{}", text(&player.stderr));
     assert!(text(&player.stdout).contains(&format!("{count} messages played")));
     let recorder = recorder.output();
@@ -162,18 +161,19 @@ fn a_bag_played_at_full_speed_is_recorded_byte_for_byte() {
 
 #[test]
 fn best_effort_subscriptions_lose_nothing_at_full_speed() {
+    let domain = domain::free();
     let (_keep, folder) = folder();
     let (source, copy) = (folder.join("source"), folder.join("copy"));
     let played = write_bag(&source, 100);
     let (source_text, copy_text) = (source.to_string_lossy(), copy.to_string_lossy());
     let topics = ["/image/compressed:sensor_msgs/msg/CompressedImage", "/odd:odd_msgs/msg/Thing"];
     let mut recorder = Running::start(jigsaw(
-        2,
+        domain,
         &["bag", "record", &copy_text, "--topics", topics[0], topics[1], "--storage", "sqlite3"],
     ));
     // Without a publisher to go by, both are subscribed best effort.
     recorder.wait_for("recording /odd");
-    let player = Running::start(jigsaw(2, &["bag", "play", &source_text, "-r", "0"])).output();
+    let player = Running::start(jigsaw(domain, &["bag", "play", &source_text, "-r", "0"])).output();
     assert!(player.status.success(), "{}", text(&player.stderr));
     assert!(!text(&player.stderr).contains("dropped"), "{}", text(&player.stderr));
     recorder.interrupt();
@@ -185,17 +185,18 @@ fn best_effort_subscriptions_lose_nothing_at_full_speed() {
 
 #[test]
 fn info_tells_what_is_in_a_bag() {
+    let domain = domain::free();
     let (_keep, folder) = folder();
     let path = folder.join("bag");
     write_bag(&path, 3);
-    let table = Running::start(jigsaw(3, &["bag", "info", &path.to_string_lossy()])).output();
+    let table = Running::start(jigsaw(domain, &["bag", "info", &path.to_string_lossy()])).output();
     let out = text(&table.stdout);
     assert!(table.status.success());
     assert!(
         out.contains("Messages:  6") && out.contains("/image/compressed") && out.contains("transient_local"),
         "{out}"
     );
-    let json = Running::start(jigsaw(3, &["bag", "info", "--json", &path.to_string_lossy()])).output();
+    let json = Running::start(jigsaw(domain, &["bag", "info", "--json", &path.to_string_lossy()])).output();
     let value: serde_json::Value = serde_json::from_slice(&json.stdout).expect("JSON");
     assert_eq!(value["messages"], 6);
     assert_eq!(value["topics"][0]["type"], "sensor_msgs/msg/CompressedImage");
@@ -203,6 +204,7 @@ fn info_tells_what_is_in_a_bag() {
 
 #[test]
 fn bad_input_is_one_clear_line_and_code_2() {
+    let domain = domain::free();
     let (_keep, folder) = folder();
     let bag = folder.join("bag");
     write_bag(&bag, 1);
@@ -222,7 +224,7 @@ fn bad_input_is_one_clear_line_and_code_2() {
         (vec!["bag", "play", &bag, "--start-offset", "5"], "nothing to play"),
         (vec!["bag", "play", &bag, "--remap", "a=b"], "remap rule 'a=b'"),
     ] {
-        let out = Running::start(jigsaw(4, &args)).output();
+        let out = Running::start(jigsaw(domain, &args)).output();
         let error = text(&out.stderr);
         assert_eq!(out.status.code(), Some(2), "{args:?}: {error}");
         assert!(error.contains(wanted), "{args:?}: {error}");

@@ -2,6 +2,8 @@
 
 #![allow(clippy::unwrap_used, reason = "a test fails by panicking")]
 
+mod domain;
+
 use std::io::Read;
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, ExitStatus, Stdio};
@@ -21,11 +23,6 @@ const PATIENCE: Duration = Duration::from_secs(120);
 
 /// How long a stopped node is left to find out that it is deaf before it is stopped once more.
 const DEAF: Duration = Duration::from_secs(3);
-
-/// A domain for each test of this file, so that tests that run side by side don't see one another.
-fn domain(test: u16) -> u16 {
-    std::env::var("ROS_DOMAIN_ID").ok().and_then(|id| id.parse::<u16>().ok()).unwrap_or(80) + test
-}
 
 /// A folder that goes with the test.
 struct Folder(PathBuf);
@@ -170,7 +167,7 @@ fn complete(assembly: &Assembly) -> bool {
 
 #[test]
 fn three_processes_assemble_a_folder_and_end_in_order() {
-    let domain = domain(0);
+    let domain = domain::free();
     let options = Options { rows: 2, columns: 3, seed: 5, noise: 2.0, blur: 1.0, ..Options::default() };
     let folder = Folder::of_puzzle("nodes", &options);
     let source = format!("source:={}", folder.path().display());
@@ -201,6 +198,7 @@ fn three_processes_assemble_a_folder_and_end_in_order() {
 
 #[test]
 fn bad_input_ends_with_one_line_and_code_2() {
+    let domain = domain::free();
     let empty = Folder::new("empty");
     let source = format!("source:={}", empty.path().display());
     let capture = env!("CARGO_BIN_EXE_capture_node");
@@ -214,7 +212,7 @@ fn bad_input_ends_with_one_line_and_code_2() {
         (solver, &["positional"], "unknown argument 'positional'"),
     ];
     for (binary, args, wanted) in cases {
-        let (status, said) = Process::start(binary, domain(1), args).end();
+        let (status, said) = Process::start(binary, domain, args).end();
         assert_eq!(status.code(), Some(2), "{args:?}: {said}");
         assert!(said.contains(wanted) && said.trim_end().lines().count() == 1, "{args:?}: {said}");
     }
@@ -222,7 +220,7 @@ fn bad_input_ends_with_one_line_and_code_2() {
 
 #[test]
 fn a_node_whose_middleware_died_ends_with_code_3() {
-    let domain = domain(2);
+    let domain = domain::free();
     let mut node = Process::start(env!("CARGO_BIN_EXE_solver_node"), domain, &[]);
     // The diagnostics tell that it is up.
     Listener::new(domain).wait(&topics::DIAGNOSTICS, |_| true);
@@ -242,7 +240,7 @@ fn a_node_whose_middleware_died_ends_with_code_3() {
 
 #[test]
 fn a_composed_cell_gives_the_same_assembly() {
-    let domain = domain(3);
+    let domain = domain::free();
     let options = Options { rows: 2, columns: 3, seed: 5, noise: 2.0, blur: 1.0, ..Options::default() };
     let folder = Folder::of_puzzle("cell", &options);
     let args = ["cell", "--source", folder.path().to_str().unwrap(), "--ros-args", "-r", "__ns:=/cell"];

@@ -4,6 +4,8 @@
 
 #![allow(clippy::unwrap_used, reason = "a test fails by panicking")]
 
+mod domain;
+
 use std::fs::File;
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, ExitStatus, Stdio};
@@ -25,18 +27,13 @@ const SILENCE: &str = "10";
 /// Pieces of the puzzle: two rows, three columns.
 const PIECES: usize = 6;
 
-/// Domains that no other test is in.
-fn first_domain() -> u16 {
-    std::env::var("ROS_DOMAIN_ID").ok().and_then(|id| id.parse().ok()).unwrap_or(80)
-}
-
 struct Cell {
     folder: tempfile::TempDir,
     domain: u16,
 }
 
 impl Cell {
-    fn new(domain: u16) -> Self {
+    fn new() -> Self {
         let folder = tempfile::tempdir().unwrap();
         let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("launch-scripts/keystore.sh");
         let made = Command::new(script)
@@ -46,7 +43,7 @@ impl Cell {
             .status()
             .unwrap();
         assert!(made.success());
-        Self { folder, domain }
+        Self { folder, domain: domain::free() }
     }
 
     fn path(&self, name: &str) -> PathBuf {
@@ -129,7 +126,7 @@ fn injecting<M: Message, T>(domain: u16, topic: &Topic<M>, message: M, action: i
 
 #[test]
 fn a_forged_assembly_reaches_the_unprotected_alone() {
-    let cell = Cell::new(first_domain() + 8);
+    let cell = Cell::new();
     let forged = Assembly { state: Assembly::COMPLETE, ..Assembly::default() };
     injecting(cell.domain, &topics::ASSEMBLY, forged, || {
         assert!(cell.watch(None, PATIENCE, 0).0.success(), "the forged assembly is one that a listener takes");
@@ -140,7 +137,7 @@ fn a_forged_assembly_reaches_the_unprotected_alone() {
 
 #[test]
 fn the_cell_talks_among_itself_alone() {
-    let cell = Cell::new(first_domain() + 7);
+    let cell = Cell::new();
     let puzzle = Puzzle::generate(&Options { rows: 2, columns: 3, seed: 5, ..Options::default() }).unwrap();
     let frames = cell.path("frames");
     std::fs::create_dir(&frames).unwrap();
@@ -174,7 +171,7 @@ fn the_cell_talks_among_itself_alone() {
 
 #[test]
 fn without_its_files_a_node_does_not_start() {
-    let cell = Cell::new(first_domain());
+    let cell = Cell::new();
     let mut node = cell.start(env!("CARGO_BIN_EXE_solver_node"), Some("/nobody"), &[]);
     assert_eq!(node.child.wait().unwrap().code(), Some(2));
     let said = node.said();

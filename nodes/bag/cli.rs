@@ -13,7 +13,7 @@ use serde_json::json;
 
 use super::play::{PlayEvent, PlayOptions, play};
 use super::qos::{Durability, QosProfile, Reliability};
-use super::record::{RecordEvent, RecordOptions, RequestedTopic, record};
+use super::record::{RecordError, RecordEvent, RecordOptions, RequestedTopic, record};
 use super::{BagReader, BagWriter, Compression, Storage, WriterOptions};
 use crate::ros::process::{Process, ProcessError, exit_code};
 
@@ -367,14 +367,19 @@ fn run_record(args: RecordArgs) -> ExitCode {
         let end = process.ending();
         Ok(Box::pin(async move {
             let spinner = ProgressBar::new_spinner();
-            if let Err(error) =
-                record(&mut session, &mut bag, &options, end, |event| show_record(&spinner, event)).await
-            {
-                outcome.set(bad_input(error));
-            }
+            let result = record(&mut session, &mut bag, &options, end, |event| show_record(&spinner, event)).await;
             spinner.finish_and_clear();
             let count = bag.message_count();
-            match bag.finish() {
+            let finished = match result {
+                // What can't be written to can't be completed either; what was flushed before can be read.
+                Err(RecordError::Bag(error)) => Err(error),
+                Err(error) => {
+                    outcome.set(bad_input(error));
+                    bag.finish()
+                }
+                Ok(()) => bag.finish(),
+            };
+            match finished {
                 Ok(()) => println!("{count} messages recorded in {}", args.bag.display()),
                 Err(error) => outcome.set(bad_input(error)),
             }

@@ -3,7 +3,8 @@
 //! A node that is started again hears the latched `pieces/features` of the feature node. But where the feature node, and
 //! the capture node before it, were started again since the camera showed the pieces, nobody has them any more. So each
 //! piece that is taken is written to a file of its own: beside its place and then renamed, so that an end at any point
-//! leaves whole files only. They are not forced to the disk: a journal outlasts a process, not a power failure.
+//! leaves whole files only. They are not forced to the disk: a journal outlasts a process, not a power failure, and a file
+//! that was damaged is known by its checksum.
 
 use std::hash::{DefaultHasher, Hash, Hasher};
 use std::io::Write;
@@ -11,6 +12,9 @@ use std::path::{Path, PathBuf};
 
 use byteorder::LittleEndian;
 use jigsaw_msgs::msg::PieceFeatures;
+
+/// Bytes of the checksum (CRC-32, little endian) at the end of a file.
+const CHECKSUM: usize = 4;
 
 /// Ending of the files of a journal; others in the folder are left alone.
 const ENDING: &str = "piece";
@@ -100,7 +104,8 @@ impl Journal {
     pub fn keep(&self, piece: &PieceFeatures) -> Result<(), JournalError> {
         let path = self.path(&piece.id);
         let damaged = |reason: String| JournalError::Damaged { path: path.clone(), reason };
-        let bytes = cdr_encoding::to_vec::<_, LittleEndian>(piece).map_err(|e| damaged(e.to_string()))?;
+        let mut bytes = cdr_encoding::to_vec::<_, LittleEndian>(piece).map_err(|e| damaged(e.to_string()))?;
+        bytes.extend(crc32fast::hash(&bytes).to_le_bytes());
         let mut file = tempfile::NamedTempFile::new_in(&self.folder).map_err(JournalError::io(&path))?;
         file.write_all(&bytes).map_err(JournalError::io(&path))?;
         file.persist(&path).map_err(|e| JournalError::io(&path)(e.error))?;
@@ -134,11 +139,13 @@ impl Journal {
 fn read(path: &Path) -> Result<PieceFeatures, JournalError> {
     let bytes = std::fs::read(path).map_err(JournalError::io(path))?;
     let damaged = |reason: String| JournalError::Damaged { path: path.to_owned(), reason };
-    let (piece, used) =
-        cdr_encoding::from_bytes::<PieceFeatures, LittleEndian>(&bytes).map_err(|e| damaged(e.to_string()))?;
-    if used != bytes.len() {
-        return Err(damaged(format!("{} bytes follow it", bytes.len() - used)));
+    let (bytes, checksum) =
+        bytes.split_last_chunk::<CHECKSUM>().ok_or_else(|| damaged("it is too short".to_owned()))?;
+    if crc32fast::hash(bytes) != u32::from_le_bytes(*checksum) {
+        return Err(damaged("its checksum is another".to_owned()));
     }
+    let (piece, _) =
+        cdr_encoding::from_bytes::<PieceFeatures, LittleEndian>(bytes).map_err(|e| damaged(e.to_string()))?;
     Ok(piece)
 }
 
@@ -184,11 +191,25 @@ mod tests {
         let journal = Journal::open(folder.path()).unwrap();
         journal.keep(&piece("a", 1)).unwrap();
         let whole = std::fs::read(journal.path("a")).unwrap();
-        std::fs::write(folder.path().join("cut.piece"), &whole[..whole.len() / 2]).unwrap();
-        std::fs::write(folder.path().join("long.piece"), [&whole[..], &[0; 8]].concat()).unwrap();
+        let other = folder.path().join("other.piece");
         std::fs::write(folder.path().join("notes.txt"), "not a piece").unwrap();
-        let (pieces, faults) = journal.pieces().unwrap();
-        assert_eq!((pieces.len(), faults.len()), (1, 2));
+        let check = |damaged: &[u8], what: &str| {
+            std::fs::write(&other, damaged).unwrap();
+            let (pieces, faults) = journal.pieces().unwrap();
+            assert_eq!((pieces, faults.len()), (vec![piece("a", 1)], 1), "{what}");
+            assert!(
+                matches!(&faults[0], JournalError::Damaged { path, .. } if *path == other),
+                "{what}: {}",
+                faults[0]
+            );
+        };
+        check(&[&whole[..], &[0; 8]].concat(), "bytes at the end");
+        for at in 0..whole.len() {
+            check(&whole[..at], &format!("cut after {at} bytes"));
+            let mut changed = whole.clone();
+            changed[at] ^= 1 << (at % 8);
+            check(&changed, &format!("a bit of byte {at} changed"));
+        }
         journal.forget_all().unwrap();
         assert!(folder.path().join("notes.txt").exists());
         let file = folder.path().join("notes.txt");

@@ -189,7 +189,7 @@ pub async fn run(
         let mut alarm = FutureExt::fuse(next.map_or_else(smol::Timer::never, smol::Timer::at));
         futures::select! {
             message = features.next() => if let Some(message) = message {
-                table.take(&message);
+                table.take(&message, &Origin::Topic);
             },
             _ = alarm => {}
             done = solving => table.publish(done).await,
@@ -257,6 +257,13 @@ fn with_params(solver: Option<Solver>, params: Params) -> Result<(Solver, Vec<Pi
             Ok((Solver::new(params)?, kept))
         }
     }
+}
+
+/// Where a piece comes from.
+enum Origin {
+    Topic,
+    /// Which has it already.
+    Journal,
 }
 
 /// The pieces on the table, and the state of the solution.
@@ -355,7 +362,7 @@ impl Table {
                     log::info!("{} pieces were kept in the journal", pieces.len());
                 }
                 faults.iter().for_each(|fault| self.health.refuse("journal", &fault.to_string()));
-                pieces.iter().for_each(|piece| self.take(piece));
+                pieces.iter().for_each(|piece| self.take(piece, &Origin::Journal));
             }
             Err(fault) => self.health.warn("journal", &fault.to_string()),
         }
@@ -369,10 +376,12 @@ impl Table {
     }
 
     /// Takes a piece in, or refuses it.
-    fn take(&mut self, message: &PieceFeatures) {
+    fn take(&mut self, message: &PieceFeatures, origin: &Origin) {
         match self.admit(message) {
             Ok(true) => {
-                self.keep_journal(|journal| journal.keep(message));
+                if matches!(origin, Origin::Topic) {
+                    self.keep_journal(|journal| journal.keep(message));
+                }
                 self.health.received();
                 self.health.figure("pieces", self.sightings.len());
                 let settle_time = Duration::from_secs_f64(self.parameters.double(&params::SETTLE_TIME));

@@ -16,6 +16,7 @@ use rand_chacha::ChaCha8Rng;
 use crate::cell::{
     self, Cell, Folder, NODES, Running, Truth, Witness, bag24, difference, eventually, is_stopped, jigsaw, runs, signal,
 };
+use crate::domain;
 
 /// How long a node is stopped: longer than any timeout between the nodes that is not there for dead hosts.
 const STOP: Duration = Duration::from_secs(12);
@@ -161,7 +162,8 @@ fn calm(folder: &Path, bag: &Path, truth: &Truth, domain: u16) -> Assembly {
 }
 
 /// A run with faults.
-fn survive(bag: &Path, domain: u16, faults: usize, seed: u64) {
+fn survive(bag: &Path, faults: usize, seed: u64) {
+    let domain = domain::free();
     let folder = Folder::new(&format!("kill-{domain}"));
     let truth = Truth::of(bag);
     let calm = calm(&folder.0, bag, &truth, domain);
@@ -203,14 +205,10 @@ fn survive(bag: &Path, domain: u16, faults: usize, seed: u64) {
     ));
 }
 
-fn domain(test: u16) -> u16 {
-    std::env::var("ROS_DOMAIN_ID").ok().and_then(|id| id.parse::<u16>().ok()).unwrap_or(80) + 10 + test
-}
-
 #[test]
 fn the_assembly_of_24_pieces_survives() {
     let seed = environment_number("JIGSAW_FAULTS_SEED", 1);
-    survive(&bag24(), domain(0), environment_number("JIGSAW_FAULTS", FEW), seed as u64);
+    survive(&bag24(), environment_number("JIGSAW_FAULTS", FEW), seed as u64);
 }
 
 #[test]
@@ -227,13 +225,13 @@ fn the_assembly_of_96_pieces_survives() {
     );
     assert!(command.arg("--out").arg(&bag).status().unwrap().success());
     let seed = environment_number("JIGSAW_FAULTS_SEED", 1) as u64;
-    survive(&bag, domain(1), faults.parse().unwrap(), seed + 1);
+    survive(&bag, faults.parse().unwrap(), seed + 1);
 }
 
 #[test]
 fn a_node_that_was_stopped_is_replaced() {
     let folder = Folder::new("stopped");
-    let domain = domain(2);
+    let domain = domain::free();
     let cell = Cell::start(&folder.0, &environment(domain), &[]);
     let witness = Witness::new(domain);
     for node in NODES {

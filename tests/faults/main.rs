@@ -14,5 +14,7 @@
 #![allow(clippy::unwrap_used, reason = "a test fails by panicking")]
 
 mod cell;
+#[path = "../domain/mod.rs"]
+mod domain;
 mod kill;
 mod network;

@@ -14,6 +14,7 @@ use jigsaw_msgs::msg::Assembly;
 use nix::sys::signal::Signal;
 
 use crate::cell::{Cell, Folder, Running, Truth, Witness, bag24, binaries, root, script, signal};
+use crate::domain;
 
 /// How long a link is cut.
 const CUT: Duration = Duration::from_secs(10);
@@ -134,7 +135,8 @@ struct Spread {
 }
 
 impl Spread {
-    fn start(network: &Network, folder: &Path, domain: u16, environment: &[(&'static str, String)]) -> Self {
+    fn start(network: &Network, folder: &Path, environment: &[(&'static str, String)]) -> Self {
+        let domain = domain::free();
         let mut environment = environment.to_vec();
         environment.push(("ROS_DOMAIN_ID", domain.to_string()));
         let node = |host: usize, name: &str, log: &str, args: &[&str]| {
@@ -187,10 +189,6 @@ impl Spread {
     }
 }
 
-fn domain(test: u16) -> u16 {
-    std::env::var("ROS_DOMAIN_ID").ok().and_then(|id| id.parse::<u16>().ok()).unwrap_or(80) + 13 + test
-}
-
 /// A line of the operators' table.
 fn tell(what: &str, begun: Instant) {
     println!("| {what} | 24 of 24 | {:.1} s |", begun.elapsed().as_secs_f64());
@@ -201,7 +199,7 @@ fn solve_under(test: u8, orders: &[&str]) {
     let Some(mut network) = Network::new(test) else { return };
     let folder = Folder::new(&format!("network-{test}"));
     orders.iter().for_each(|order| network.order(order));
-    let spread = Spread::start(&network, &folder.0, domain(test.into()), &[]);
+    let spread = Spread::start(&network, &folder.0, &[]);
     let begun = Instant::now();
     let _camera = spread.play(&network, &["--rate", "0"]);
     spread.solved();
@@ -215,7 +213,7 @@ fn solve_without(lost: Signal, test: u8, orders: &[&str], is_static: bool) {
     orders.iter().for_each(|order| network.order(order));
     let peers = [CAPTURE, FEATURE, SOLVER, HERE].map(|host| network.address(host).to_string()).join(";");
     let environment = if is_static { vec![("ROS_STATIC_PEERS", peers)] } else { Vec::new() };
-    let spread = Spread::start(&network, &folder.0, domain(test.into()), &environment);
+    let spread = Spread::start(&network, &folder.0, &environment);
     // Slowly: when the two are seen to share, there must be pieces left to take over.
     let _camera = spread.play(&network, &["--loop", "--rate", "0.4"]);
     spread.shared();
@@ -262,7 +260,7 @@ fn frames_that_are_late_and_overtake_one_another() {
 fn a_link_that_is_cut_for_10_s() {
     let Some(mut network) = Network::new(6) else { return };
     let folder = Folder::new("network-6");
-    let spread = Spread::start(&network, &folder.0, domain(6), &[]);
+    let spread = Spread::start(&network, &folder.0, &[]);
     let _camera = spread.play(&network, &["--loop", "--rate", "1"]);
     spread.shared();
     let feature = network.ports[FEATURE].clone();
