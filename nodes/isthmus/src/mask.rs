@@ -7,11 +7,13 @@
 //!    whole shapes is right.
 //! 2. *Blocks that stand out* from the ground by more than its scatter are joined to connected components. The threshold is
 //!    near the ground, so that dark print on dark ground still belongs to its shape.
-//! 3. *Pixels*: about each component the frame is cut out, in a form in which half-way between two fixed levels is half-way
+//! 3. *Levels*: the contrast of a component is measured deep within it, beyond the blur of its edge. It is one number, or a surface as
+//!    light falls off, or (print) a map of blocks. Means of noise that black or white clips are put right.
+//! 4. *Pixels*: about each component the frame is cut out, in a form in which half-way between two fixed levels is half-way
 //!    between the shape's own level near the border and the ground's: as it is, where both are uniform, else
 //!    divided by the local contrast. Pixels beyond half-way are joined to components once more: neighbours whose shadows
 //!    or glow met come apart.
-//! 4. *Rejection*, each with its [`Reason`]: cut by the frame's edge, too small beside the others, thread-like (hairs,
+//! 5. *Rejection*, each with its [`Reason`]: cut by the frame's edge, too small beside the others, thread-like (hairs,
 //!    scanner edges), faint (glare), two shapes that touch (of about twice the usual area, with an isthmus between the halves). Where that
 //!    isthmus is too narrow to be the neck of one of them they are cut apart instead ([`Segmentation::separated`]).
 //!
@@ -33,6 +35,7 @@
 //! # Ok::<(), isthmus::mask::MaskError>(())
 //! ```
 
+mod clipping;
 mod crop;
 mod frame;
 mod ground;
@@ -77,7 +80,7 @@ impl Segmenter {
         self.blocks.fill(frame);
         let mut best: Option<(usize, Segmentation)> = None;
         for candidate in ground::candidates(&self.blocks) {
-            let ground = ground::fit(&self.blocks, candidate, std::mem::take(&mut self.residual));
+            let ground = ground::fit(frame, &self.blocks, candidate, std::mem::take(&mut self.residual));
             let segmentation = self.shapes(frame, &ground, parameters);
             self.residual = ground.residual;
             let area = segmentation.cutouts.iter().map(|c| c.aoi.width as usize * c.aoi.height as usize).sum();

@@ -44,45 +44,44 @@ impl Crop {
         let c = components.list[k];
         let (block, columns) = (blocks.size, blocks.columns);
         let levels = Levels::of(standing, k);
-        let crop = self;
         let margin = MARGIN + block;
         let rows = RowSource { frame, ground, block };
-        (crop.x, crop.y) = ((c.left * block) as i32 - margin as i32, (c.top * block) as i32 - margin as i32);
-        crop.width = (c.right - c.left) * block + 2 * margin;
-        crop.height = (c.bottom - c.top) * block + 2 * margin;
-        crop.contrast = levels.contrast;
-        let plain = levels.uniform && frame.format == PixelFormat::Grey;
+        (self.x, self.y) = ((c.left * block) as i32 - margin as i32, (c.top * block) as i32 - margin as i32);
+        self.width = (c.right - c.left) * block + 2 * margin;
+        self.height = (c.bottom - c.top) * block + 2 * margin;
+        self.contrast = levels.contrast;
+        let plain = levels.is_uniform() && frame.format == PixelFormat::Grey;
         if plain {
-            crop.ground_level = levels.ground;
+            self.ground_level = levels.ground;
             // A sum of rounded numbers; a level is one of the 8-bit scale.
-            crop.shape_level = (levels.ground + levels.sense * levels.contrast).clamp(0.0, 255.0);
-        } else if levels.uniform {
-            (crop.shape_level, crop.ground_level) = (levels.contrast, 0.0);
+            self.shape_level = (levels.ground + levels.sense * levels.contrast).clamp(0.0, 255.0);
+        } else if levels.is_uniform() {
+            (self.shape_level, self.ground_level) = (levels.contrast, 0.0);
         } else {
             // Half the contrast and the room above it fill half the scale.
             let noise = ground.scatter * block as f32 / levels.contrast.max(f32::MIN_POSITIVE);
             let contrast = (127.5 / (0.5 + DIVIDED_ROOM * noise)).min(MAX_DIVIDED_CONTRAST);
-            (crop.shape_level, crop.ground_level) = (127.5 + contrast / 2.0, 127.5 - contrast / 2.0);
+            (self.shape_level, self.ground_level) = (127.5 + contrast / 2.0, 127.5 - contrast / 2.0);
         }
-        let ground_pixel = crop.ground_level.round().clamp(0.0, 255.0) as u8;
-        crop.pixels.clear();
-        crop.pixels.resize(crop.width * crop.height, ground_pixel);
+        let ground_pixel = self.ground_level.round().clamp(0.0, 255.0) as u8;
+        self.pixels.clear();
+        self.pixels.resize(self.width * self.height, ground_pixel);
         let label = k as u32;
-        for (row, out) in crop.pixels.chunks_exact_mut(crop.width).enumerate() {
-            let y = crop.y + row as i32;
+        for (row, out) in self.pixels.chunks_exact_mut(self.width).enumerate() {
+            let y = self.y + row as i32;
             if y < 0 || y >= frame.height as i32 {
                 continue;
             }
             let y = y as usize;
-            let from = crop.x.max(0) as usize;
-            let to = frame.width.min((crop.x + crop.width as i32) as usize);
-            let out = &mut out[(from as i32 - crop.x) as usize..][..to - from];
+            let from = self.x.max(0) as usize;
+            let to = frame.width.min((self.x + self.width as i32) as usize);
+            let out = &mut out[(from as i32 - self.x) as usize..][..to - from];
             let source = frame.row(y);
             let owners = &owner[y / block * columns..][..columns];
             if plain {
                 out.copy_from_slice(&source[from..to]);
             } else {
-                levels.fill_row(&rows, (y, from), out, [crop.shape_level, crop.ground_level]);
+                levels.fill_row(&rows, (y, from), out, [self.shape_level, self.ground_level]);
             }
             // What belongs to other components is made ground.
             let within = from / block..to.div_ceil(block);
@@ -97,7 +96,7 @@ impl Crop {
                 }
             }
         }
-        crop.noise_level = crop.noise(standing, k);
+        self.noise_level = self.noise(standing, k);
     }
 
     /// Standard deviation of the grey levels, from differences of neighbouring pixels, in shape and ground; the larger.

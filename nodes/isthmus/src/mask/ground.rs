@@ -4,6 +4,7 @@
 //! the frame's outer rows and columns, tell the ground from the shapes. A quadratic surface through the ground's
 //! blocks follows uneven light; what differs from it by more than its scatter is shape.
 
+use super::clipping::Clipping;
 use super::frame::Frame;
 use nalgebra::{Matrix6, Vector6};
 
@@ -111,7 +112,7 @@ fn block_size(frame_side: usize) -> usize {
     }
 }
 
-/// A quadratic surface over the frame, in block coordinates scaled to -1..1.
+/// A quadratic surface over a frame or a part of it, in block coordinates scaled to -1..1.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Surface {
     coefficients: Vector6<f64>,
@@ -122,6 +123,41 @@ impl Surface {
     fn basis(scale: [f64; 2], column: f64, row: f64) -> Vector6<f64> {
         let (u, v) = (column * scale[0] - 1.0, row * scale[1] - 1.0);
         Vector6::new(1.0, u, v, u * u, u * v, v * v)
+    }
+
+    /// Least squares fit to the levels of blocks (column, row, level) of a picture of so many columns and rows, repeated without what lies
+    /// far from the first fit.
+    pub(super) fn fit(size: [usize; 2], levels: impl Iterator<Item = ([f64; 2], f32)>) -> Self {
+        let scale = size.map(|n| 2.0 / (n.max(2) - 1) as f64);
+        let samples: Vec<(Vector6<f64>, f64)> =
+            levels.map(|([column, row], level)| (Self::basis(scale, column, row), f64::from(level))).collect();
+        let level = f64::from(median(samples.iter().map(|s| s.1 as f32).collect()));
+        let mut surface = Self { coefficients: Vector6::new(level, 0.0, 0.0, 0.0, 0.0, 0.0), scale };
+        // Between the rounds, samples far from the fit (specks, shadows) are left out: those beyond three deviations.
+        let mut limit = f64::INFINITY;
+        for _ in 0..2 {
+            // The lower half of the normal equations; the factorisation looks at no more.
+            let mut normal = Matrix6::zeros();
+            let mut right = Vector6::zeros();
+            for (basis, value) in &samples {
+                if (value - surface.coefficients.dot(basis)).abs() <= limit {
+                    for j in 0..6 {
+                        for i in j..6 {
+                            normal[(i, j)] += basis[i] * basis[j];
+                        }
+                    }
+                    right += basis * *value;
+                }
+            }
+            // A tiny ridge: the ground of a tight crop may not determine all coefficients.
+            normal += Matrix6::identity() * (1e-6 * samples.len().max(1) as f64);
+            if let Some(factor) = normal.cholesky() {
+                surface.coefficients = factor.solve(&right);
+            }
+            let residuals = samples.iter().map(|(b, v)| (v - surface.coefficients.dot(b)).abs() as f32).collect();
+            limit = (3.0 / 0.6745 * f64::from(median(residuals))).max(1.0);
+        }
+        surface
     }
 
     /// Level at a block.
@@ -260,12 +296,12 @@ fn rim_blocks(blocks: &Blocks) -> impl Iterator<Item = usize> {
 }
 
 /// Fits the ground to a class of blocks, and finds what stands out from it; `residual` is memory to be used again.
-pub(super) fn fit(blocks: &Blocks, candidate: Candidate, residual: Vec<f32>) -> Ground {
+pub(super) fn fit(frame: &Frame<'_>, blocks: &Blocks, candidate: Candidate, residual: Vec<f32>) -> Ground {
     let Candidate { mut is_ground } = candidate;
     let mut ground = Ground::default();
     let mut residuals = Vec::with_capacity(is_ground.len());
     for _ in 0..ROUNDS {
-        ground.surfaces = blocks.planes.iter().map(|plane| fit_surface(blocks, plane, &is_ground)).collect();
+        ground.surfaces = blocks.planes.iter().map(|plane| fit_surface(blocks, plane, &is_ground, None)).collect();
         let residual_of = |s: &Sample| {
             let channels = blocks.planes.iter().zip(&ground.surfaces);
             let (column, row) = (s.column as f64, s.row as f64);
@@ -292,6 +328,11 @@ pub(super) fn fit(blocks: &Blocks, candidate: Candidate, residual: Vec<f32>) -> 
             break;
         }
     }
+    let clipping = Clipping::of(noise(frame, blocks, &is_ground));
+    if clipping.is_some() {
+        let fit = |plane: &Vec<f32>| fit_surface(blocks, plane, &is_ground, clipping.as_ref());
+        ground.surfaces = blocks.planes.iter().map(fit).collect();
+    }
     let mut levels = vec![0.0; blocks.columns];
     ground.residual = residual;
     ground.residual.resize(blocks.columns * blocks.rows, 0.0);
@@ -300,6 +341,7 @@ pub(super) fn fit(blocks: &Blocks, candidate: Candidate, residual: Vec<f32>) -> 
         for (row, (values, residuals)) in rows.enumerate() {
             surface.fill_line(row as f64, 0.0, 1.0, &mut levels);
             for ((residual, value), level) in residuals.iter_mut().zip(values).zip(&levels) {
+                let value = clipping.as_ref().map_or(*value, |clipping| clipping.level(*value));
                 let difference = (value - level).abs();
                 *residual = if channel == 0 { difference } else { residual.max(difference) };
             }
@@ -308,46 +350,29 @@ pub(super) fn fit(blocks: &Blocks, candidate: Candidate, residual: Vec<f32>) -> 
     ground
 }
 
-/// Least squares fit of a surface to the ground's blocks, repeated without what lies far from the first fit.
-fn fit_surface(blocks: &Blocks, plane: &[f32], is_ground: &[bool]) -> Surface {
-    let scale = [blocks.columns, blocks.rows].map(|n| 2.0 / (n.max(2) - 1) as f64);
+/// Standard deviation of the grey levels of a frame's ground, from differences of neighbouring pixels.
+fn noise(frame: &Frame<'_>, blocks: &Blocks, is_ground: &[bool]) -> f32 {
+    /// Median of the absolute difference of two normal numbers, in standard deviations.
+    const MEDIAN: f32 = 0.953_9;
+    let channels = frame.format.channels();
+    let chosen = blocks.samples.iter().zip(is_ground).filter(|(_, is_ground)| **is_ground).map(|(s, _)| s);
+    let difference = |s: &Sample| {
+        let row = frame.row((s.row * blocks.size).min(frame.height - 1));
+        let at = s.column * blocks.size * channels;
+        let next = row.get(at + channels).unwrap_or(&row[at]);
+        f32::from(row[at].abs_diff(*next))
+    };
+    median(chosen.map(difference).collect()) / MEDIAN
+}
+
+/// Fits a surface to the ground's blocks.
+fn fit_surface(blocks: &Blocks, plane: &[f32], is_ground: &[bool], clipping: Option<&Clipping>) -> Surface {
     let total = is_ground.iter().filter(|g| **g).count();
     let stride = (total / FIT_SAMPLES).max(1);
-    let samples: Vec<(Vector6<f64>, f64)> = blocks
-        .samples
-        .iter()
-        .zip(is_ground)
-        .filter(|(_, is_ground)| **is_ground)
-        .step_by(stride)
-        .map(|(s, _)| (Surface::basis(scale, s.column as f64, s.row as f64), f64::from(plane[s.block])))
-        .collect();
-    let level = f64::from(median(samples.iter().map(|s| s.1 as f32).collect()));
-    let mut surface = Surface { coefficients: Vector6::new(level, 0.0, 0.0, 0.0, 0.0, 0.0), scale };
-    // Between the rounds, samples far from the fit (specks, shadows) are left out: those beyond three deviations.
-    let mut limit = f64::INFINITY;
-    for _ in 0..2 {
-        // The lower half of the normal equations; the factorisation looks at no more.
-        let mut normal = Matrix6::zeros();
-        let mut right = Vector6::zeros();
-        for (basis, value) in &samples {
-            if (value - surface.coefficients.dot(basis)).abs() <= limit {
-                for j in 0..6 {
-                    for i in j..6 {
-                        normal[(i, j)] += basis[i] * basis[j];
-                    }
-                }
-                right += basis * *value;
-            }
-        }
-        // A tiny ridge: the ground of a tight crop may not determine all coefficients.
-        normal += Matrix6::identity() * (1e-6 * samples.len().max(1) as f64);
-        if let Some(factor) = normal.cholesky() {
-            surface.coefficients = factor.solve(&right);
-        }
-        let residuals = samples.iter().map(|(b, v)| (v - surface.coefficients.dot(b)).abs() as f32).collect();
-        limit = (3.0 / 0.6745 * f64::from(median(residuals))).max(1.0);
-    }
-    surface
+    let chosen = blocks.samples.iter().zip(is_ground).filter(|(_, is_ground)| **is_ground).step_by(stride);
+    let level = |level| clipping.map_or(level, |clipping| clipping.level(level));
+    let samples = chosen.map(|(s, _)| ([s.column as f64, s.row as f64], level(plane[s.block])));
+    Surface::fit([blocks.columns, blocks.rows], samples)
 }
 
 /// Two classes of values.
