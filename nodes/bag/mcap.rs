@@ -18,8 +18,10 @@ use mcap::sans_io::message_reader::{MessageReadEvent, MessageReader};
 use mcap::sans_io::summary_reader::{SummaryReadEvent, SummaryReader, SummaryReaderOptions};
 use mcap::{Channel, McapError, Summary};
 
-use super::read::{FileContents, MAX_RECORD_BYTES, MAX_RESIDENT_BYTES, MessageIter, REORDER_BYTES, Selection};
-use super::write::{Compression, StorageWriter};
+use super::storage::{
+    Compression, FileContents, MAX_RECORD_BYTES, MAX_RESIDENT_BYTES, MessageIter, REORDER_BYTES, Selection,
+    StorageWriter, up_to_error,
+};
 use super::{BagError, BagWarning, RawMessage, Topic, TopicCount, qos};
 
 /// The first bytes of every MCAP file.
@@ -359,7 +361,8 @@ fn indexed_messages(path: &Path, summary: &Summary, selection: &Selection) -> Re
         .with_record_length_limit(MAX_RECORD_BYTES);
     let reader = IndexedReader::new_with_options(summary, options).map_err(|e| damaged(path, &e))?;
     let file = File::open(path).map_err(|e| io_error(path, e))?;
-    Ok(Box::new(Indexed { path: path.to_owned(), file, reader, topics, chunk: Vec::new(), ended: false }))
+    let mut indexed = Indexed { path: path.to_owned(), file, reader, topics, chunk: Vec::new() };
+    Ok(up_to_error(move || indexed.step()))
 }
 
 /// Messages by the index.
@@ -369,7 +372,6 @@ struct Indexed {
     reader: IndexedReader,
     topics: HashMap<u16, Arc<Topic>>,
     chunk: Vec<u8>,
-    ended: bool,
 }
 
 impl Indexed {
@@ -398,19 +400,6 @@ impl Indexed {
                 return Some(Err(damaged(&self.path, &e)));
             }
         }
-    }
-}
-
-impl Iterator for Indexed {
-    type Item = Result<RawMessage, BagError>;
-
-    fn next(&mut self) -> Option<Self::Item> {
-        if self.ended {
-            return None;
-        }
-        let item = self.step();
-        self.ended = !matches!(item, Some(Ok(_)));
-        item
     }
 }
 

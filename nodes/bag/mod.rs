@@ -10,7 +10,7 @@
 //! ```
 //!
 //! A bag that is cut off or damaged is read up to the damage: what is wrong is a [`BagWarning`] where the rest can be
-//! used, a [`BagError`] where not. Memory stays bounded by the constants of [`read`], whatever a file claims.
+//! used, a [`BagError`] where not. Memory stays bounded by the constants of [`storage`], whatever a file claims.
 
 pub mod cdr;
 pub mod cli;
@@ -19,6 +19,7 @@ pub mod play;
 pub mod qos;
 pub mod read;
 pub mod record;
+pub mod storage;
 pub mod write;
 
 mod mcap;
@@ -33,8 +34,9 @@ use std::sync::Arc;
 use thiserror::Error;
 
 pub use qos::QosProfile;
-pub use read::{BagReader, Messages, Selection};
-pub use write::{BagWriter, Compression, TopicId, WriterOptions};
+pub use read::{BagReader, Messages};
+pub use storage::{Compression, Selection};
+pub use write::{BagWriter, TopicId, WriterOptions};
 
 /// A topic as a bag describes it.
 #[derive(Debug, Clone, PartialEq, Eq, Hash)]

@@ -12,7 +12,7 @@ use std::fs::File;
 use std::io::{Read, Seek, SeekFrom};
 use std::path::Path;
 
-use super::read::{MAX_RECORD_BYTES, MAX_RESIDENT_BYTES};
+use super::storage::{MAX_RECORD_BYTES, MAX_RESIDENT_BYTES};
 
 /// Where the header says how long pages are, and how many bytes at the end of each are not used.
 const HEADER_BYTES: usize = 100;

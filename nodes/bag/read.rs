@@ -10,7 +10,6 @@
 //! # Ok::<(), jigsaw_nodes::bag::BagError>(())
 //! ```
 
-use std::collections::BTreeSet;
 use std::fs::File;
 use std::io::Read;
 use std::path::{Path, PathBuf};
@@ -18,58 +17,11 @@ use std::path::{Path, PathBuf};
 use tempfile::NamedTempFile;
 
 use super::metadata::{self, Metadata};
+use super::storage::{FileContents, MAX_RECORD_BYTES, MessageIter, Selection};
 use super::{BagError, BagWarning, RawMessage, Storage, TopicCount, mcap, sqlite};
-
-/// Largest message, record or chunk believed \[bytes\]. Larger claims are taken for damage: an uncompressed 8k colour
-/// frame has 100 MB.
-pub const MAX_RECORD_BYTES: usize = 256 * 1024 * 1024;
-
-/// Most bytes of overlapping MCAP chunks held in memory; files that need more are read front to back.
-pub const MAX_RESIDENT_BYTES: usize = 512 * 1024 * 1024;
-
-/// Bytes of messages held back to put a file without an index in order of time; recorders write nearly in order.
-pub const REORDER_BYTES: usize = 32 * 1024 * 1024;
 
 /// The first bytes of a zstd frame: a whole storage file compressed by the recorder.
 const ZSTD_MAGIC: &[u8] = &[0x28, 0xb5, 0x2f, 0xfd];
-
-/// Messages of one storage file.
-pub(super) type MessageIter = Box<dyn Iterator<Item = Result<RawMessage, BagError>> + Send>;
-
-/// Which messages to read.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Selection {
-    /// Topic names; `None` for all topics.
-    pub topics: Option<BTreeSet<String>>,
-    /// Only messages received at this time or later \[ns since the epoch\].
-    pub from_ns: i64,
-}
-
-impl Selection {
-    /// Every message of the bag.
-    #[must_use]
-    pub fn all() -> Self {
-        Self { topics: None, from_ns: i64::MIN }
-    }
-
-    /// Every message on the topics named.
-    #[must_use]
-    pub fn topics<S: Into<String>>(names: impl IntoIterator<Item = S>) -> Self {
-        Self { topics: Some(names.into_iter().map(Into::into).collect()), from_ns: i64::MIN }
-    }
-
-    pub(super) fn has_topic(&self, name: &str) -> bool {
-        self.topics.as_ref().is_none_or(|names| names.contains(name))
-    }
-}
-
-/// What a storage file holds.
-pub(super) struct FileContents {
-    pub(super) topics: Vec<TopicCount>,
-    /// Times of the first and the last message \[ns since the epoch\].
-    pub(super) span_ns: Option<(i64, i64)>,
-    pub(super) warning: Option<BagWarning>,
-}
 
 enum Opened {
     Mcap(mcap::McapFile),

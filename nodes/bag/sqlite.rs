@@ -12,8 +12,7 @@ use rusqlite::config::DbConfig;
 use rusqlite::{Connection, OpenFlags, OptionalExtension, params};
 
 use super::pages::{Pages, Place};
-use super::read::{FileContents, MAX_RECORD_BYTES, MessageIter, Selection};
-use super::write::StorageWriter;
+use super::storage::{FileContents, MAX_RECORD_BYTES, MessageIter, Selection, StorageWriter, up_to_error};
 use super::{BagError, BagWarning, RawMessage, Topic, TopicCount, qos};
 
 /// The first bytes of every sqlite3 database.
@@ -140,15 +139,15 @@ impl SqliteFile {
                 pages.data(&place).map(|cdr| Ok(message(topic, place.time_ns, cdr)))
             })));
         }
-        Ok(Box::new(Rows {
+        let mut rows = Rows {
             path: self.path.clone(),
             connection: connect(&self.path)?,
             topics,
             after: None,
             from_ns,
             page: Vec::new().into_iter(),
-            ended: false,
-        }))
+        };
+        Ok(up_to_error(move || rows.step()))
     }
 }
 
@@ -237,7 +236,6 @@ struct Rows {
     after: Option<Key>,
     from_ns: i64,
     page: std::vec::IntoIter<Key>,
-    ended: bool,
 }
 
 impl Rows {
@@ -280,19 +278,6 @@ impl Rows {
             let data = self.data(key.id).map_err(|e| damaged(&self.path, &e));
             return Some(data.map(|cdr| message(topic, key.time_ns, cdr)));
         }
-    }
-}
-
-impl Iterator for Rows {
-    type Item = Result<RawMessage, BagError>;
-
-    fn next(&mut self) -> Option<Self::Item> {
-        if self.ended {
-            return None;
-        }
-        let item = self.step();
-        self.ended = !matches!(item, Some(Ok(_)));
-        item
     }
 }
 

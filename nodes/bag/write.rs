@@ -20,17 +20,8 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use super::metadata::{self, Contents};
+use super::storage::{Compression, StorageWriter};
 use super::{BagError, Storage, Topic, TopicCount, mcap, sqlite};
-
-/// Compression of the chunks of an MCAP file.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default)]
-pub enum Compression {
-    /// None: for messages that are compressed already, such as PNG.
-    None,
-    /// zstd, which readers of every language know.
-    #[default]
-    Zstd,
-}
 
 /// How to write a bag.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
@@ -50,18 +41,6 @@ impl Default for WriterOptions {
 /// A topic of a [`BagWriter`].
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub struct TopicId(usize);
-
-/// What a storage file takes in.
-pub(super) trait StorageWriter {
-    /// Announces a topic and gives it an id.
-    fn add_topic(&mut self, topic: &Topic) -> Result<u16, BagError>;
-    /// Appends a message.
-    fn write(&mut self, id: u16, log_time_ns: i64, publish_time_ns: i64, cdr: &[u8]) -> Result<(), BagError>;
-    /// Makes what was written so far survive the end of the process.
-    fn flush(&mut self) -> Result<(), BagError>;
-    /// Completes the file.
-    fn finish(&mut self, metadata_yaml: &str) -> Result<(), BagError>;
-}
 
 /// Writes a new bag.
 pub struct BagWriter {

@@ -13,6 +13,7 @@ use jigsaw_msgs::std_msgs::msg::Header;
 
 use super::known::FrameName;
 use super::source::Frame;
+use crate::ros::health::shown;
 
 /// Largest side of a frame. Real cameras end at about 20 000; a claim beyond that is nonsense that would cost memory.
 pub const MAX_SIDE_PX: u32 = 32_768;
@@ -125,19 +126,6 @@ impl FrameError {
 
 /// Longest name of a frame or a source, in bytes; far more than anyone writes, and little enough to be kept.
 pub const MAX_NAME_LENGTH: usize = 1024;
-
-/// Most characters of a text that a refusal repeats.
-const MOST_SHOWN: usize = 40;
-
-/// A text of someone else's as a refusal repeats it: not longer than a line, without control characters.
-pub fn shown(text: &str) -> String {
-    let mut short: String =
-        text.chars().take(MOST_SHOWN).map(|c| if c.is_control() { char::REPLACEMENT_CHARACTER } else { c }).collect();
-    if short.len() < text.len() {
-        short.push('…');
-    }
-    short
-}
 
 /// A field that breaks a rule: field, value, rule.
 pub type Fault = (&'static str, String, &'static str);

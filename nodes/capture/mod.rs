@@ -22,8 +22,9 @@ use jigsaw_msgs::builtin_interfaces::msg::Time;
 use jigsaw_msgs::msg::PieceImage;
 use jigsaw_msgs::std_srvs::srv::{Trigger, TriggerResponse};
 
+use crate::ros::activity::WhileInactive;
 use crate::ros::health::Health;
-use crate::ros::lifecycle::{Forget, WhileInactive};
+use crate::ros::lifecycle::Forget;
 use crate::ros::params::Parameters;
 use crate::ros::process::{ProcessError, Program, Work};
 use crate::ros::session::{Call, Session, Settings};

@@ -10,7 +10,8 @@ use jigsaw_msgs::msg::{Isthmus as IsthmusMessage, PieceFeatures, PieceImage, Ske
 use jigsaw_msgs::sensor_msgs::msg::Image;
 use jigsaw_msgs::std_msgs::msg::Header;
 
-use crate::capture::convert::{MAX_AREA_PX, MAX_SIDE_PX, header_fault, shown, text_fault};
+use crate::capture::convert::{MAX_AREA_PX, MAX_SIDE_PX, header_fault, text_fault};
+use crate::ros::health::shown;
 
 /// Samples of an isthmus distance function in the message: what the paper's plots show, and what 4-byte floats of a
 /// match segment of common length (some 100 px) can tell apart.

@@ -12,7 +12,8 @@ use jigsaw_msgs::sensor_msgs::msg::Image;
 
 use crate::capture::params::threads;
 use crate::picture::{InspectionStyle, inspection};
-use crate::ros::lifecycle::{Forget, WhileInactive};
+use crate::ros::activity::WhileInactive;
+use crate::ros::lifecycle::Forget;
 use crate::ros::process::{ProcessError, Program, Work};
 use crate::ros::session::{Audience, CHANNEL_DEPTH, Session, Settings};
 use crate::ros::topics;

@@ -31,6 +31,19 @@ struct Inner {
 /// How long after the last refusal or error a node still reports a warning.
 const WARNING_SECONDS: u64 = 10;
 
+/// Most characters of a text that a refusal repeats.
+const MOST_SHOWN: usize = 40;
+
+/// A text of someone else's as a refusal repeats it: not longer than a line, without control characters.
+pub fn shown(text: &str) -> String {
+    let mut short: String =
+        text.chars().take(MOST_SHOWN).map(|c| if c.is_control() { char::REPLACEMENT_CHARACTER } else { c }).collect();
+    if short.len() < text.len() {
+        short.push('…');
+    }
+    short
+}
+
 /// Label of the state in which a node works; see [`super::lifecycle`].
 const ACTIVE: &str = "active";
 

@@ -1,11 +1,15 @@
 //! Middleware glue: everything that knows DDS, and nothing that knows jigsaw puzzles beyond the names of the topics.
 //!
+//! Arrows point one way: [`process`] opens a [`session`]; what a session can do beyond topics ([`actions`], [`lifecycle`],
+//! [`raw`], `server`, [`services`]) stands beside it and is not known to it.
+//!
 //! | module | what stands there, and nowhere else |
 //! | --- | --- |
 //! | [`actions`] | goals as a stream |
 //! | [`args`] | the command line of ROS: remapping, parameters, names |
 //! | [`params`] | declaration, check and documentation of parameters |
 //! | [`services`] | the six parameter services |
+//! | [`activity`] | whether a node works now, and what becomes of its inputs while it does not |
 //! | [`lifecycle`] | states and transitions of a managed node |
 //! | `security` | keystore and enclave of SROS2 |
 //! | `server` | one service: requests in, answers out |
@@ -21,6 +25,7 @@
 //! | [`transforms`] | pixels (y down) to metres (y up) |
 
 pub mod actions;
+pub mod activity;
 pub mod args;
 pub mod health;
 pub mod lifecycle;

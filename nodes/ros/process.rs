@@ -31,13 +31,23 @@ use ros2_client::{Context, NodeName, NodeOptions};
 use rustdds::dds::statusevents::{DomainParticipantStatusEvent, StatusEvented};
 use rustdds::{DomainParticipant, DomainParticipantBuilder, RTPSEntity};
 
+use super::activity::Activity;
 use super::args::{ArgsError, RosArgs, domain_id};
 use super::health::Health;
-use super::lifecycle::{AUTOSTART, Activity};
 use super::params::{Default as DefaultValue, ParameterError, Parameters, Rule, Spec};
 use super::session::{Clock, Endpoints, Session, SessionError};
 use super::turn::Turn;
 use super::{logging, missed, peers, security, services, topics};
+
+/// Whether a node starts to work by itself.
+pub const AUTOSTART: Spec = Spec {
+    name: "autostart",
+    default: DefaultValue::Bool(true),
+    unit: "",
+    rule: Rule::Any,
+    description: "Configure and activate the node when it starts; otherwise it waits, unconfigured, for a lifecycle manager.",
+    read_only: true,
+};
 
 /// Whether the time comes from `/clock`.
 pub const USE_SIM_TIME: Spec = Spec {

@@ -13,6 +13,7 @@ use std::time::{Duration, Instant};
 use futures::channel::{mpsc, oneshot};
 use futures::stream::FuturesUnordered;
 use futures::{FutureExt, SinkExt, StreamExt};
+use jigsaw_msgs::{Message, Service};
 use ros2_client::{MessageInfo, RmwRequestId, Subscription};
 use rustdds::no_key::DataWriter;
 use rustdds::{
@@ -23,7 +24,7 @@ use serde::Serialize;
 use serde::de::DeserializeOwned;
 
 use super::health::Health;
-use super::session::{CHANNEL_DEPTH, Session, SessionError};
+use super::session::{CHANNEL_DEPTH, Call, Session, SessionError};
 use super::topics::SERVICE_QOS;
 
 /// How long an answer waits for its reader. Discovery takes about 0.1 s on one host and less than a second between
@@ -41,6 +42,16 @@ struct Early<Resp> {
 }
 
 impl Session {
+    /// The calls of a service.
+    ///
+    /// # Errors
+    /// [`SessionError`] for a bad name, or where the middleware refuses.
+    pub fn serve<S: Service + 'static>(&mut self, service: &str) -> Result<mpsc::Receiver<Call<S>>, SessionError> {
+        let name = self.names.service(service)?;
+        let types = [S::Request::TYPE.dds_name, S::Response::TYPE.dds_name].map(str::to_owned);
+        self.open_server(&name, types, |request, reply| Call { request, reply })
+    }
+
     /// The calls of a service of this absolute name and these types on DDS, each made into a `T` of the request and
     /// the way back. A call whose way back is dropped is never answered.
     ///

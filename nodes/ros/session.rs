@@ -15,9 +15,9 @@ use jigsaw_msgs::{Message, Service};
 use ros2_client::{Context, MessageInfo, MessageTypeName, Name, Node};
 use rustdds::{GUID, RTPSEntity};
 
+use super::activity::Activity;
 use super::args::{ArgsError, NodeNames};
 use super::health::Health;
-use super::lifecycle::Activity;
 use super::params::Parameters;
 use super::topics::Topic;
 
@@ -276,16 +276,6 @@ impl Session {
             }
         });
         Ok((sender, Audience { endpoints: self.endpoints.clone(), writer }))
-    }
-
-    /// The calls of a service.
-    ///
-    /// # Errors
-    /// As for [`Self::subscribe`].
-    pub fn serve<S: Service + 'static>(&mut self, service: &str) -> Result<mpsc::Receiver<Call<S>>, SessionError> {
-        let name = self.names.service(service)?;
-        let types = [S::Request::TYPE.dds_name, S::Response::TYPE.dds_name].map(str::to_owned);
-        self.open_server(&name, types, |request, reply| Call { request, reply })
     }
 
     /// Who listens to a writer that was opened beside the publishers of this session.

@@ -21,9 +21,10 @@ use jigsaw_msgs::tf2_msgs::msg::TFMessage;
 use jigsaw_msgs::visualization_msgs::msg::{Marker, MarkerArray};
 use nalgebra::{Isometry2, Point2};
 
-use crate::capture::convert::{MAX_SIDE_PX, header_fault, shown, text_fault};
+use crate::capture::convert::{MAX_SIDE_PX, header_fault, text_fault};
 use crate::feature::convert::{MAX_ID_LENGTH, SCALE_RULE, SCALES, image_message, is_piece_id};
 use crate::picture::{self, AssemblyStyle};
+use crate::ros::health::shown;
 use crate::ros::transforms::{PixelPlane, pose_message};
 
 /// Most points of a border: a piece of some 8000 pixels, sampled at every pixel of its circumference.

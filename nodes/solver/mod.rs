@@ -24,8 +24,9 @@ use jigsaw_msgs::visualization_msgs::msg::MarkerArray;
 
 use crate::capture::inactive;
 use crate::ros::actions::{Goal, GoalEnd};
+use crate::ros::activity::{Activity, WhileInactive};
 use crate::ros::health::Health;
-use crate::ros::lifecycle::{Activity, Forget, WhileInactive};
+use crate::ros::lifecycle::Forget;
 use crate::ros::params::Parameters;
 use crate::ros::process::{ProcessError, Program, Work};
 use crate::ros::session::{Call, Session, Settings};
