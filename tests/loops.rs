@@ -2,8 +2,11 @@
 
 #![allow(clippy::unwrap_used, reason = "a test fails by panicking")]
 
+mod frames;
+
 use std::sync::Arc;
 
+use frames::camera_image;
 use futures::channel::{mpsc, oneshot};
 use futures::{StreamExt, stream};
 use image::ExtendedColorType;
@@ -13,7 +16,6 @@ use jigsaw_msgs::builtin_interfaces::msg::{Duration, Time};
 use jigsaw_msgs::geometry_msgs::msg::Pose;
 use jigsaw_msgs::msg::{Assembly, PieceFeatures, PieceImage};
 use jigsaw_msgs::sensor_msgs::msg::{CompressedImage, Image};
-use jigsaw_msgs::std_msgs::msg::Header;
 use jigsaw_msgs::std_srvs::srv::{Trigger, TriggerRequest, TriggerResponse};
 use jigsaw_msgs::tf2_msgs::msg::TFMessage;
 use jigsaw_msgs::visualization_msgs::msg::{Marker, MarkerArray};
@@ -45,26 +47,9 @@ fn puzzle() -> Puzzle {
     Puzzle::generate(&Options { rows: 2, columns: 3, seed: 11, noise: 2.0, blur: 1.0, ..Options::default() }).unwrap()
 }
 
-fn header(sec: i32) -> Header {
-    Header { stamp: Time { sec, nanosec: 0 }, frame_id: "camera".to_owned() }
-}
-
 fn raw_frames(puzzle: &Puzzle) -> Vec<Frame> {
-    (0..puzzle.frame_count())
-        .map(|k| {
-            let frame = puzzle.render(k);
-            let image = Image {
-                header: header(k as i32),
-                height: frame.height,
-                width: frame.width,
-                encoding: "mono8".to_owned(),
-                is_bigendian: 0,
-                step: frame.width,
-                data: frame.pixels,
-            };
-            Frame::Raw(TOPIC.to_owned(), image)
-        })
-        .collect()
+    let stamp = |k: usize| Time { sec: k as i32, nanosec: 0 };
+    (0..puzzle.frame_count()).map(|k| Frame::Raw(TOPIC.to_owned(), camera_image(puzzle, k, stamp(k)))).collect()
 }
 
 fn settings(specs: &'static [Spec], health: &Arc<Health>) -> Settings {
@@ -203,18 +188,19 @@ fn raw_and_compressed_frames_give_the_same_pieces() {
     let puzzle = puzzle();
     let compressed = (0..puzzle.frame_count())
         .map(|k| {
-            let frame = puzzle.render(k);
+            let Image { header, width, height, data, .. } =
+                camera_image(&puzzle, k, Time { sec: k as i32, nanosec: 0 });
             let mut png = std::io::Cursor::new(Vec::new());
             image::write_buffer_with_format(
                 &mut png,
-                &frame.pixels,
-                frame.width,
-                frame.height,
+                &data,
+                width,
+                height,
                 ExtendedColorType::L8,
                 image::ImageFormat::Png,
             )
             .unwrap();
-            let image = CompressedImage { header: header(k as i32), format: "png".into(), data: png.into_inner() };
+            let image = CompressedImage { header, format: "png".into(), data: png.into_inner() };
             Frame::Compressed(TOPIC.to_owned(), image)
         })
         .collect();

@@ -3,6 +3,9 @@
 
 #![allow(clippy::unwrap_used, reason = "a test fails by panicking")]
 
+mod frames;
+
+use frames::camera_image;
 use isthmus::{Extractor, mask};
 use jigsaw::generate::{Options, Puzzle};
 use jigsaw_msgs::Message;
@@ -10,7 +13,6 @@ use jigsaw_msgs::action::AssembleGoal;
 use jigsaw_msgs::builtin_interfaces::msg::Time;
 use jigsaw_msgs::msg::{PieceFeatures, PieceImage};
 use jigsaw_msgs::sensor_msgs::msg::{CompressedImage, Image};
-use jigsaw_msgs::std_msgs::msg::Header;
 use jigsaw_nodes::capture::convert::{FrameHead, picture, piece_message};
 use jigsaw_nodes::capture::source::Frame;
 use jigsaw_nodes::{feature, solver};
@@ -21,16 +23,7 @@ const LONGEST_LINE: usize = 400;
 
 fn image() -> Image {
     let options = Options { rows: 1, columns: 2, seed: 5, piece_size: Some(60.0), ..Options::default() };
-    let frame = Puzzle::generate(&options).unwrap().render(0);
-    Image {
-        header: Header { stamp: Time { sec: 7, nanosec: 5 }, frame_id: "camera".to_owned() },
-        height: frame.height,
-        width: frame.width,
-        encoding: "mono8".to_owned(),
-        is_bigendian: 0,
-        step: frame.width,
-        data: frame.pixels,
-    }
+    camera_image(&Puzzle::generate(&options).unwrap(), 0, Time { sec: 7, nanosec: 5 })
 }
 
 fn piece_image() -> PieceImage {

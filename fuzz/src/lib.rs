@@ -2,6 +2,10 @@
 //! memory without bound. The fuzz engine calls these functions with whatever it finds; the test `tests/fuzz.rs` of the
 //! cell calls them with damaged copies of the seeds.
 
+#[path = "../../tests/frames/mod.rs"]
+mod frames;
+
+use frames::camera_image;
 use image::{ExtendedColorType, ImageFormat};
 use isthmus::contour::Border;
 use isthmus::{Extractor, Features, Point, mask};
@@ -10,7 +14,6 @@ use jigsaw::{Params, Piece, Solver};
 use jigsaw_msgs::builtin_interfaces::msg::Time;
 use jigsaw_msgs::msg::{PieceFeatures, PieceImage};
 use jigsaw_msgs::sensor_msgs::msg::{CompressedImage, Image};
-use jigsaw_msgs::std_msgs::msg::Header;
 use jigsaw_nodes::bag::{BagReader, BagWriter, QosProfile, Selection, Storage, Topic, WriterOptions, cdr};
 use jigsaw_nodes::capture::convert::{FrameHead, Pixels, picture, piece_message};
 use jigsaw_nodes::capture::source::Frame;
@@ -205,21 +208,7 @@ fn puzzle() -> Option<Puzzle> {
 
 fn grey_frames() -> Vec<Image> {
     let render = |puzzle: &Puzzle| {
-        (0..puzzle.frame_count())
-            .map(|k| {
-                let frame = puzzle.render(k);
-                let stamp = Time { sec: k as i32 + 1, nanosec: 5 };
-                Image {
-                    header: Header { stamp, frame_id: "camera".to_owned() },
-                    height: frame.height,
-                    width: frame.width,
-                    encoding: "mono8".to_owned(),
-                    is_bigendian: 0,
-                    step: frame.width,
-                    data: frame.pixels,
-                }
-            })
-            .collect()
+        (0..puzzle.frame_count()).map(|k| camera_image(puzzle, k, Time { sec: k as i32 + 1, nanosec: 5 })).collect()
     };
     puzzle().as_ref().map(render).unwrap_or_default()
 }
