@@ -197,6 +197,28 @@ fn three_processes_assemble_a_folder_and_end_in_order() {
 }
 
 #[test]
+fn a_journal_that_cannot_be_written_keeps_no_piece_from_being_solved() {
+    let domain = domain::free();
+    let options = Options { rows: 2, columns: 2, seed: 5, ..Options::default() };
+    let folder = Folder::of_puzzle("journal", &options);
+    let kept = Folder::new("kept");
+    // No file may be as long as a piece is: as on a full disk, but for the system's words.
+    const LIMITED: &str = "trap '' XFSZ; ulimit -f 1; exec \"$0\" \"$@\"";
+    let journal = format!("journal:={}", kept.path().display());
+    let args = ["-c", LIMITED, env!("CARGO_BIN_EXE_solver_node"), "--ros-args", "-p", &journal];
+    let solver = Process::start("sh", domain, &args);
+    let _feature = Process::start(env!("CARGO_BIN_EXE_feature_node"), domain, &[]);
+    let source = format!("source:={}", folder.path().display());
+    let _capture = Process::start(env!("CARGO_BIN_EXE_capture_node"), domain, &["--ros-args", "-p", &source]);
+    Listener::new(domain).wait(&topics::ASSEMBLY, |assembly| assembly.pieces.len() == 4 && complete(assembly));
+    solver.signal(Signal::SIGTERM);
+    let (status, said) = solver.end();
+    assert_eq!(status.code(), Some(0), "{said}");
+    assert!(said.contains("WARN") && said.contains("journal"), "{said}");
+    assert_eq!(std::fs::read_dir(kept.path()).unwrap().count(), 0, "half a piece is left behind");
+}
+
+#[test]
 fn bad_input_ends_with_one_line_and_code_2() {
     let domain = domain::free();
     let empty = Folder::new("empty");

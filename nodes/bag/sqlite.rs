@@ -5,11 +5,12 @@
 //! is told to take the schema as it is (`writable_schema`, here on a connection that cannot write).
 
 use std::collections::HashMap;
+use std::ffi::OsStr;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use rusqlite::config::DbConfig;
-use rusqlite::{Connection, OpenFlags, OptionalExtension, params};
+use rusqlite::{Connection, ErrorCode, OpenFlags, OptionalExtension, params};
 
 use super::pages::{Pages, Place};
 use super::storage::{FileContents, MAX_RECORD_BYTES, MessageIter, Selection, StorageWriter, up_to_error};
@@ -54,8 +55,24 @@ enum Access {
 }
 
 fn connect(path: &Path) -> Result<Connection, BagError> {
-    let flags = OpenFlags::SQLITE_OPEN_READ_ONLY | OpenFlags::SQLITE_OPEN_NO_MUTEX;
-    let connection = Connection::open_with_flags(path, flags).map_err(|e| damaged(path, &e))?;
+    connect_by(path, path.as_os_str(), OpenFlags::empty())
+}
+
+/// The file as it is. A recorder that ended within a transaction has left a journal by which the library would take the
+/// transaction back, for which it would have to write to the bag.
+fn connect_as_is(path: &Path) -> Result<Connection, BagError> {
+    let plain = |byte: &u8| byte.is_ascii_alphanumeric() || b"/._-~".contains(byte);
+    let bytes = path.as_os_str().as_encoded_bytes();
+    let encoded: String = bytes
+        .iter()
+        .map(|byte| if plain(byte) { char::from(*byte).to_string() } else { format!("%{byte:02x}") })
+        .collect();
+    connect_by(path, format!("file:{encoded}?immutable=1").as_ref(), OpenFlags::SQLITE_OPEN_URI)
+}
+
+fn connect_by(path: &Path, name: &OsStr, how: OpenFlags) -> Result<Connection, BagError> {
+    let flags = OpenFlags::SQLITE_OPEN_READ_ONLY | OpenFlags::SQLITE_OPEN_NO_MUTEX | how;
+    let connection = Connection::open_with_flags(name, flags).map_err(|e| damaged(path, &e))?;
     // A damaged page may claim anything; a message longer than this is refused by the library itself.
     let limit = i32::try_from(MAX_RECORD_BYTES).unwrap_or(i32::MAX);
     connection.set_limit(rusqlite::limits::Limit::SQLITE_LIMIT_LENGTH, limit).map_err(|e| damaged(path, &e))?;
@@ -72,13 +89,16 @@ impl SqliteFile {
                 Self::salvage(path, "the last page is cut".to_owned())
             }
             Ok((topics, counts)) => Ok(Self::with(path, topics, Access::Indexed, &counts, None)),
+            Err(error) if error.sqlite_error_code() == Some(ErrorCode::ReadOnly) => {
+                Self::salvage(path, "the recorder ended within a transaction".to_owned())
+            }
             Err(error) => Self::salvage(path, error.to_string()),
         }
     }
 
     /// Looks through a file that is not whole.
     fn salvage(path: &Path, reason: String) -> Result<(Self, FileContents), BagError> {
-        let connection = connect(path)?;
+        let connection = connect_as_is(path)?;
         let topics = connection
             .set_db_config(DbConfig::SQLITE_DBCONFIG_WRITABLE_SCHEMA, true)
             .and_then(|_| read_topics(&connection))
