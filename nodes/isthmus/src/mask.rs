@@ -164,7 +164,7 @@ impl Segmenter {
     /// Number of pixels of a fine component on the frame's rim.
     fn rim_contact(&self, frame: &Frame<'_>, index: usize) -> usize {
         let crop = &self.crop;
-        let runs = self.fine.runs.iter().filter(|r| r.label == index);
+        let runs = self.fine.runs_of(index);
         runs.map(|r| {
             let y = crop.y + r.row as i32;
             if y == 0 || y == frame.height as i32 - 1 {

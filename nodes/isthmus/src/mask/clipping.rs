@@ -16,7 +16,7 @@ const STEPS: usize = 64;
 const EXTENT: f32 = 4.0;
 
 /// Mean grey levels of clipped noise, and the levels they stand for.
-#[derive(Debug)]
+#[derive(Debug, Clone)]
 pub(super) struct Clipping {
     /// For each whole level the mean of the clipped pixels; ascending.
     means: [f32; LEVELS],
@@ -27,20 +27,21 @@ pub(super) struct Clipping {
 }
 
 impl Clipping {
-    /// Table for a standard deviation of the noise; `None` where it is too little to matter.
-    pub(super) fn of(noise: f32) -> Option<Self> {
-        if !(noise >= MIN_NOISE && noise.is_finite()) {
+    /// Table for a standard deviation of the noise; `None` where it is too little to matter to means from a least to a greatest.
+    pub(super) fn of(noise: f32, [least, greatest]: [f32; 2]) -> Option<Self> {
+        let top = (LEVELS - 1) as f32;
+        let reach = REACH * noise;
+        let is_clipped = least < reach || greatest > top - reach;
+        if !(noise >= MIN_NOISE && noise.is_finite() && is_clipped) {
             return None;
         }
         let deviations: [f32; STEPS] = std::array::from_fn(|i| EXTENT * ((2 * i + 1) as f32 / STEPS as f32 - 1.0));
         let weights = deviations.map(|d| (-d * d / 2.0).exp());
         let total: f32 = weights.iter().sum();
-        let top = (LEVELS - 1) as f32;
         let mean = |level: usize| {
             let clipped = |(d, w): (&f32, &f32)| (level as f32 + d * noise).clamp(0.0, top) * w;
             deviations.iter().zip(&weights).map(clipped).sum::<f32>() / total
         };
-        let reach = REACH * noise;
         Some(Self { means: std::array::from_fn(mean), low: reach, high: top - reach })
     }
 
@@ -65,7 +66,7 @@ mod tests {
 
     #[test]
     fn a_clipped_mean_is_the_level_without_clipping() {
-        let clipping = Clipping::of(20.0).unwrap_or_else(|| panic!("much noise"));
+        let clipping = Clipping::of(20.0, [30.0, 225.0]).unwrap();
         // Of a normal distribution cut off a standard deviation below its mean: sigma (phi(1) - (1 - Phi(1))).
         let excess = 20.0 * (0.241_971 - 0.158_655);
         assert!((clipping.level(20.0 + excess) - 20.0).abs() < TOLERANCE);
@@ -76,7 +77,8 @@ mod tests {
 
     #[test]
     fn little_noise_is_not_clipped() {
-        assert!(Clipping::of(0.5).is_none());
-        assert!(Clipping::of(f32::NAN).is_none());
+        assert!(Clipping::of(0.5, [0.0, 255.0]).is_none());
+        assert!(Clipping::of(10.0, [40.0, 200.0]).is_none());
+        assert!(Clipping::of(f32::NAN, [0.0, 255.0]).is_none());
     }
 }

@@ -45,7 +45,7 @@ impl Crop {
         let (block, columns) = (blocks.size, blocks.columns);
         let levels = Levels::of(standing, k);
         let margin = MARGIN + block;
-        let rows = RowSource { frame, ground, block };
+        let mut rows = RowSource { frame, ground, block, lines: Default::default() };
         (self.x, self.y) = ((c.left * block) as i32 - margin as i32, (c.top * block) as i32 - margin as i32);
         self.width = (c.right - c.left) * block + 2 * margin;
         self.height = (c.bottom - c.top) * block + 2 * margin;
@@ -65,24 +65,30 @@ impl Crop {
         }
         let ground_pixel = self.ground_level.round().clamp(0.0, 255.0) as u8;
         self.pixels.clear();
-        self.pixels.resize(self.width * self.height, ground_pixel);
+        let (width, x) = (self.width, self.x);
+        self.pixels.reserve(width * self.height);
         let label = k as u32;
-        for (row, out) in self.pixels.chunks_exact_mut(self.width).enumerate() {
+        for row in 0..self.height {
+            let begin = self.pixels.len();
             let y = self.y + row as i32;
             if y < 0 || y >= frame.height as i32 {
+                self.pixels.resize(begin + width, ground_pixel);
                 continue;
             }
             let y = y as usize;
-            let from = self.x.max(0) as usize;
-            let to = frame.width.min((self.x + self.width as i32) as usize);
-            let out = &mut out[(from as i32 - self.x) as usize..][..to - from];
-            let source = frame.row(y);
+            let from = x.max(0) as usize;
+            let to = frame.width.min((x + width as i32) as usize);
+            let at = begin + (from as i32 - x) as usize;
+            self.pixels.resize(at, ground_pixel);
             let owners = &owner[y / block * columns..][..columns];
             if plain {
-                out.copy_from_slice(&source[from..to]);
+                self.pixels.extend_from_slice(&frame.row(y)[from..to]);
             } else {
-                levels.fill_row(&rows, (y, from), out, [self.shape_level, self.ground_level]);
+                self.pixels.resize(at + to - from, ground_pixel);
+                levels.fill_row(&mut rows, (y, from), &mut self.pixels[at..], [self.shape_level, self.ground_level]);
             }
+            self.pixels.resize(begin + width, ground_pixel);
+            let out = &mut self.pixels[at..at + to - from];
             // What belongs to other components is made ground.
             let within = from / block..to.div_ceil(block);
             let is_foreign = |owner: u32| owner != label && owner != NOBODY;

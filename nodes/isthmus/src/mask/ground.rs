@@ -191,6 +191,20 @@ pub(super) struct Ground {
     pub(super) threshold: f32,
     /// Standard deviation of the ground's blocks.
     pub(super) scatter: f32,
+    /// What noise beyond black and white does to the means of blocks; the surfaces are free of it, the residuals are not.
+    clipping: Option<Clipping>,
+}
+
+impl Ground {
+    /// By how much a block differs from the ground, clipping put right.
+    pub(super) fn contrast(&self, blocks: &Blocks, column: usize, row: usize) -> f32 {
+        let block = row * blocks.columns + column;
+        let Some(clipping) = &self.clipping else { return self.residual[block] };
+        let channels = blocks.planes.iter().zip(&self.surfaces);
+        let differences = channels
+            .map(|(plane, surface)| (clipping.level(plane[block]) - surface.at(column as f64, row as f64)).abs());
+        differences.fold(0.0, f32::max)
+    }
 }
 
 /// A block that differs from the ground by more than this many standard deviations of the ground's blocks is shape.
@@ -204,6 +218,8 @@ const MIN_RELATIVE_RESIDUAL: f32 = 0.12;
 const SAMPLES: usize = 5_000;
 /// Blocks used for the fit: more do not make a quadratic any better.
 const FIT_SAMPLES: usize = 800;
+/// One in so many of the ground's blocks tells its scatter: a median of a thousand is known to a thirtieth.
+const SCATTER_STEP: usize = 4;
 /// Rounds of fitting the ground and asking again what belongs to it.
 const ROUNDS: usize = 3;
 /// Depths in the frame, as parts of its smaller side, at which rows and columns vote for the ground: beyond scanner edges, and
@@ -309,7 +325,8 @@ pub(super) fn fit(frame: &Frame<'_>, blocks: &Blocks, candidate: Candidate, resi
         };
         residuals.clear();
         residuals.extend(blocks.samples.iter().map(residual_of));
-        let scatter: Vec<f32> = residuals.iter().zip(&is_ground).filter(|(_, g)| **g).map(|(r, _)| *r).collect();
+        let of_ground = residuals.iter().zip(&is_ground).filter(|(_, g)| **g);
+        let scatter: Vec<f32> = of_ground.step_by(SCATTER_STEP).map(|(r, _)| *r).collect();
         // The median of absolute residuals is 0.67 standard deviations.
         let sigma = median(scatter) / 0.6745;
         let split = otsu(&residuals);
@@ -328,11 +345,6 @@ pub(super) fn fit(frame: &Frame<'_>, blocks: &Blocks, candidate: Candidate, resi
             break;
         }
     }
-    let clipping = Clipping::of(noise(frame, blocks, &is_ground));
-    if clipping.is_some() {
-        let fit = |plane: &Vec<f32>| fit_surface(blocks, plane, &is_ground, clipping.as_ref());
-        ground.surfaces = blocks.planes.iter().map(fit).collect();
-    }
     let mut levels = vec![0.0; blocks.columns];
     ground.residual = residual;
     ground.residual.resize(blocks.columns * blocks.rows, 0.0);
@@ -341,13 +353,24 @@ pub(super) fn fit(frame: &Frame<'_>, blocks: &Blocks, candidate: Candidate, resi
         for (row, (values, residuals)) in rows.enumerate() {
             surface.fill_line(row as f64, 0.0, 1.0, &mut levels);
             for ((residual, value), level) in residuals.iter_mut().zip(values).zip(&levels) {
-                let value = clipping.as_ref().map_or(*value, |clipping| clipping.level(*value));
                 let difference = (value - level).abs();
                 *residual = if channel == 0 { difference } else { residual.max(difference) };
             }
         }
     }
+    ground.clipping = clipping(frame, blocks, &is_ground);
+    if let Some(clipping) = &ground.clipping {
+        let fit = |plane: &Vec<f32>| fit_surface(blocks, plane, &is_ground, Some(clipping));
+        ground.surfaces = blocks.planes.iter().map(fit).collect();
+    }
     ground
+}
+
+/// What noise does to the levels of a frame, if it reaches beyond black or white anywhere.
+fn clipping(frame: &Frame<'_>, blocks: &Blocks, is_ground: &[bool]) -> Option<Clipping> {
+    let levels = blocks.samples.iter().flat_map(|s| blocks.planes.iter().map(|plane| plane[s.block]));
+    let (low, high) = levels.fold((f32::MAX, f32::MIN), |(low, high), level| (low.min(level), high.max(level)));
+    Clipping::of(noise(frame, blocks, is_ground), [low, high])
 }
 
 /// Standard deviation of the grey levels of a frame's ground, from differences of neighbouring pixels.
@@ -356,6 +379,7 @@ fn noise(frame: &Frame<'_>, blocks: &Blocks, is_ground: &[bool]) -> f32 {
     const MEDIAN: f32 = 0.953_9;
     let channels = frame.format.channels();
     let chosen = blocks.samples.iter().zip(is_ground).filter(|(_, is_ground)| **is_ground).map(|(s, _)| s);
+    let chosen = chosen.step_by(SCATTER_STEP);
     let difference = |s: &Sample| {
         let row = frame.row((s.row * blocks.size).min(frame.height - 1));
         let at = s.column * blocks.size * channels;

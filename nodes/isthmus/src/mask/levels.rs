@@ -22,11 +22,13 @@ const SETTLED: f32 = 0.985;
 const MAP_NOISE: f32 = 0.004;
 /// How many blocks beyond its border a shape's levels matter: the blur of its edge, and the interpolation.
 const BORDER_BLOCKS: usize = 3;
-/// Least contrast that a smooth course may fall to in the surroundings of a shape, as a part of the median: far from the blocks it was
-/// learned from, it must not change its sign.
-const LEAST_LIGHT: f32 = 0.1;
+/// Least contrast that a smooth course may fall to at the corners of a shape's box, as a part of the median: light on a shape varies less,
+/// glare and shadows, which are no shapes, more.
+const LEAST_LIGHT: f32 = 0.5;
 /// Blocks of a shape looked at to measure its levels, roughly: beyond, medians get no better.
 const LEVEL_SAMPLES: usize = 1_000;
+/// The same where they are noisy and their course is sought.
+const NOISY_SAMPLES: usize = 8_000;
 
 /// How a contrast runs over a component's bounding box, in blocks.
 #[derive(Debug, Default)]
@@ -73,7 +75,6 @@ impl Levels {
             .map(|(column, row)| surface(column, row));
         let (low, high) = corners.iter().fold((f32::MAX, f32::MIN), |(l, h), v| (l.min(*v), h.max(*v)));
         let grey = blocks.planes.len() == 1;
-        let step = (((c.area / LEVEL_SAMPLES) as f64).sqrt() as usize).max(1);
         let mut levels = Self {
             left: c.left,
             top: c.top,
@@ -82,43 +83,53 @@ impl Levels {
             ground: corners.iter().sum::<f32>() / corners.len() as f32,
             ..Self::default()
         };
+        let contrast_of = |(column, row): (usize, usize)| ground.contrast(blocks, column, row);
+        // Blocks from which all directions lead through the component for a while, or out of the frame.
         let reach = ((LEVEL_DEPTH * (c.area as f64).sqrt()) as usize).clamp(1, MAX_LEVEL_DEPTH / blocks.size);
-        // A block from which all directions lead through the component for a while, or out of the frame.
-        let inside = |column: usize, row: usize| -> bool {
-            [row.saturating_sub(reach), row, (row + reach).min(blocks.rows - 1)].into_iter().all(|row| {
-                [column.saturating_sub(reach), column, (column + reach).min(columns - 1)]
-                    .into_iter()
-                    .all(|column| standing.is_of(k, column, row))
-            })
-        };
-        let mut list = Vec::new();
-        let mut signed = Vec::new();
-        let blocks_in = |step: usize| {
-            (c.top..c.bottom).step_by(step).flat_map(move |r| (c.left..c.right).step_by(step).map(move |c| (c, r)))
-        };
-        for (column, row) in blocks_in(step).filter(|(column, row)| inside(*column, *row)) {
-            let block = row * columns + column;
-            list.push(ground.residual[block]);
-            if grey {
-                signed.push(blocks.planes[0][block] - surface(column, row));
+        let inner_blocks = |samples: usize| {
+            let step = (((c.area / samples) as f64).sqrt() as usize).max(1);
+            let mut inner: Vec<(usize, usize)> = Vec::with_capacity(c.area / (step * step) + 1);
+            for run in components.runs_of(k).filter(|run| (run.row - c.top) % step == 0) {
+                let from = if run.start == 0 { 0 } else { run.start + reach };
+                let to = if run.end == columns { columns } else { run.end.saturating_sub(reach) };
+                let rows = [run.row.saturating_sub(reach), (run.row + reach).min(blocks.rows - 1)];
+                inner.extend((from..to).step_by(step).map(|column| (column, run.row)).filter(|(column, _)| {
+                    let across = [column.saturating_sub(reach), *column, (column + reach).min(columns - 1)];
+                    rows.iter().all(|row| across.iter().all(|column| standing.is_of(k, *column, *row)))
+                }));
             }
-        }
-        levels.take_sense(&signed, grey);
+            inner
+        };
+        let mut inner = inner_blocks(LEVEL_SAMPLES);
+        let mut list: Vec<f32> = inner.iter().map(|block| contrast_of(*block)).collect();
+        let is_brighter =
+            |(column, row): &(usize, usize)| blocks.planes[0][row * columns + column] > surface(*column, *row);
+        levels.take_sense(inner.iter().filter(|block| grey && is_brighter(block)).count(), inner.len(), grey);
         levels.contrast = quantile(&mut list, 0.5);
         let is_ground_even = |contrast| high - low <= UNIFORM_GROUND * contrast && (levels.one_sided || !grey);
-        if !list.is_empty() && is_ground_even(levels.contrast) && is_uniform(&mut list, levels.contrast, ground.scatter)
-        {
-            return levels;
+        if !list.is_empty() {
+            if is_ground_even(levels.contrast) && is_uniform(&mut list, levels.contrast, ground.scatter) {
+                return levels;
+            }
+            if ground.scatter > MAP_NOISE * levels.contrast {
+                inner = inner_blocks(NOISY_SAMPLES);
+            }
+            if let Some(light) = levels.smooth(&inner, &mut list, ground.scatter, contrast_of) {
+                levels.course = Course::Smooth(light);
+                return levels;
+            }
         }
         // The edge's blur reaches some blocks deep: the shape's own level is found beyond it.
         let depths = standing.depths(k);
         let settled = settled_depth(&depths, |i| {
             ground.residual[(c.top + i / levels.width) * columns + c.left + i % levels.width]
         });
-        let residual = |(column, row): (usize, usize)| ground.residual[row * columns + column];
-        let deep = || blocks_in(1).zip(&depths).filter(|(_, depth)| **depth >= settled).map(|(block, _)| block);
+        let blocks_in = || (c.top..c.bottom).flat_map(|row| (c.left..c.right).map(move |column| (column, row)));
+        let is_deep = |depth: u8| depth >= settled;
+        inner.clear();
+        inner.extend(blocks_in().zip(&depths).filter(|(_, depth)| is_deep(**depth)).map(|(block, _)| block));
         list.clear();
-        list.extend(deep().map(residual));
+        list.extend(inner.iter().map(|block| contrast_of(*block)));
         if settled < INNER_DEPTH {
             // Thinner than three blocks: the strongest blocks are the best there is.
             levels.contrast = quantile(&mut list, 0.9);
@@ -130,20 +141,10 @@ impl Levels {
         if is_ground_even(levels.contrast) && is_uniform(&mut list, levels.contrast, ground.scatter) {
             return levels;
         }
-        let local = |(column, row): (usize, usize)| [(column - c.left) as f64, (row - c.top) as f64];
-        let stride = (list.len() / LEVEL_SAMPLES).max(1);
-        let light =
-            Surface::fit([levels.width, levels.height], deep().step_by(stride).map(|b| (local(b), residual(b))));
-        let off = |block| {
-            let [column, row] = local(block);
-            residual(block) - light.at(column, row)
-        };
-        list.clear();
-        list.extend(deep().step_by(stride).map(off));
-        levels.course = if is_uniform(&mut list, levels.contrast, ground.scatter) {
+        levels.course = if let Some(light) = levels.smooth(&inner, &mut list, ground.scatter, contrast_of) {
             Course::Smooth(light)
         } else {
-            let map = blocks_in(1).zip(&depths).map(|(b, depth)| if *depth >= settled { residual(b) } else { 0.0 });
+            let map = blocks_in().zip(&depths).map(|(b, depth)| if is_deep(*depth) { contrast_of(b) } else { 0.0 });
             let noise = ground.scatter / levels.contrast.max(f32::MIN_POSITIVE);
             let reach = usize::from(settled) + BORDER_BLOCKS;
             Course::Map(levels.spread_out(map.collect(), 2.0 * ground.threshold, reach, noise))
@@ -151,17 +152,38 @@ impl Levels {
         levels
     }
 
+    /// The contrast of blocks as a smooth surface over the component, if it is one; `list` is memory to be used.
+    fn smooth(
+        &self,
+        inner: &[(usize, usize)],
+        list: &mut Vec<f32>,
+        scatter: f32,
+        contrast_of: impl Fn((usize, usize)) -> f32,
+    ) -> Option<Surface> {
+        let local = |(column, row): (usize, usize)| [(column - self.left) as f64, (row - self.top) as f64];
+        let chosen = || inner.iter().step_by((inner.len() / NOISY_SAMPLES).max(1));
+        let light = Surface::fit([self.width, self.height], chosen().map(|b| (local(*b), contrast_of(*b))));
+        list.clear();
+        list.extend(chosen().map(|block| {
+            let [column, row] = local(*block);
+            contrast_of(*block) - light.at(column, row)
+        }));
+        let [right, bottom] = [self.width, self.height].map(|side| (side - 1) as f64);
+        let corners = [(0.0, 0.0), (right, 0.0), (0.0, bottom), (right, bottom)];
+        let is_light = corners.iter().all(|(x, y)| light.at(*x, *y) >= LEAST_LIGHT * self.contrast);
+        (is_light && is_uniform(list, self.contrast, scatter)).then_some(light)
+    }
+
     /// Whether one pair of levels will do.
     pub(super) fn is_uniform(&self) -> bool {
         matches!(self.course, Course::Uniform)
     }
 
-    /// Whether the shape is brighter or darker than the ground, from blocks' signed residuals.
-    fn take_sense(&mut self, signed: &[f32], grey: bool) {
-        let brighter = signed.iter().filter(|s| **s > 0.0).count();
-        self.sense = if 2 * brighter >= signed.len() { 1.0 } else { -1.0 };
+    /// Whether the shape is brighter or darker than the ground, from the number of blocks that are brighter.
+    fn take_sense(&mut self, brighter: usize, all: usize, grey: bool) {
+        self.sense = if 2 * brighter >= all { 1.0 } else { -1.0 };
         // A twentieth of the blocks may be specks or print.
-        self.one_sided = grey && !signed.is_empty() && brighter.min(signed.len() - brighter) * 20 <= signed.len();
+        self.one_sided = grey && all > 0 && brighter.min(all - brighter) * 20 <= all;
     }
 
     /// Spreads the levels of the inner blocks out over the box, each block taking the mean of its neighbours that have a level;
@@ -238,16 +260,27 @@ impl Levels {
     }
 
     /// Fills a row of pixels with their difference from the ground, divided by the local contrast unless that is uniform.
-    pub(super) fn fill_row(&self, rows: &RowSource<'_>, (y, from): (usize, usize), out: &mut [u8], levels: [f32; 2]) {
-        let RowSource { frame, ground, block } = *rows;
+    pub(super) fn fill_row(
+        &self,
+        rows: &mut RowSource<'_>,
+        (y, from): (usize, usize),
+        out: &mut [u8],
+        levels: [f32; 2],
+    ) {
+        /// Floating point numbers of this size have no fraction.
+        const WHOLE: f32 = 8_388_608.0;
+        let (frame, ground, block) = (rows.frame, rows.ground, rows.block);
         let in_blocks = |pixel: usize| (pixel as f64 - (block - 1) as f64 / 2.0) / block as f64;
         let channels = frame.format.channels();
         let source = &frame.row(y)[from * channels..];
-        let mut difference = vec![0.0f32; out.len()];
-        let mut line = vec![0.0f32; out.len()];
+        let [difference, line] = &mut rows.lines;
+        for line in [&mut *difference, &mut *line] {
+            line.clear();
+            line.resize(out.len(), 0.0);
+        }
         for (c, surface) in ground.surfaces.iter().enumerate() {
-            surface.fill_line(in_blocks(y), in_blocks(from), 1.0 / block as f64, &mut line);
-            let places = difference.iter_mut().zip(&line);
+            surface.fill_line(in_blocks(y), in_blocks(from), 1.0 / block as f64, line);
+            let places = difference.iter_mut().zip(&*line);
             if self.one_sided {
                 // One channel: neighbouring pixels go through the processor together.
                 for ((d, g), p) in places.zip(source) {
@@ -260,20 +293,22 @@ impl Levels {
             }
         }
         let [shape_level, ground_level] = levels;
-        self.fill_reciprocals(block, (y, from), &mut line);
-        for ((out, d), reciprocal) in out.iter_mut().zip(&difference).zip(&line) {
-            // Half a level up and cut off is rounded; beyond 0 and 255 the conversion saturates.
-            *out = (ground_level + 0.5 + (shape_level - ground_level) * d * reciprocal) as u8;
+        self.fill_reciprocals(block, (y, from), line);
+        for ((out, d), reciprocal) in out.iter_mut().zip(&*difference).zip(&*line) {
+            let level = ground_level + (shape_level - ground_level) * d * reciprocal;
+            // Added to 2^23, a number from 0 to 255 is rounded, and its whole part is the lowest byte.
+            *out = (level.clamp(0.0, 255.0) + WHOLE).to_bits() as u8;
         }
     }
 }
 
 /// Where the pixels of a row come from.
-#[derive(Clone, Copy)]
 pub(super) struct RowSource<'a> {
     pub(super) frame: &'a Frame<'a>,
     pub(super) ground: &'a Ground,
     pub(super) block: usize,
+    /// Memory for figures of the row's pixels.
+    pub(super) lines: [Vec<f32>; 2],
 }
 
 /// Whether levels (of which the order gets lost) vary little, beside a contrast and what noise accounts for.

@@ -47,6 +47,15 @@ impl Components {
         self.row = 0;
     }
 
+    /// The runs of a component (after [`Components::close`]), found among those of its rows.
+    pub(super) fn runs_of(&self, label: usize) -> impl Iterator<Item = &Run> {
+        let [from, to] = self
+            .list
+            .get(label)
+            .map_or([0, 0], |c| [c.top, c.bottom].map(|row| self.runs.partition_point(|run| run.row < row)));
+        self.runs[from..to].iter().filter(move |run| run.label == label)
+    }
+
     /// Begins a row; rows come in order, each once.
     pub(super) fn begin_row(&mut self, row: usize) {
         self.previous = self.current..self.runs.len();

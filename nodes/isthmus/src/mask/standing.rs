@@ -51,7 +51,7 @@ impl Standing<'_> {
         let c = self.components.list[k];
         let (width, height) = (c.right - c.left, c.bottom - c.top);
         let mut depths = vec![0; width * height];
-        for run in self.components.runs.iter().filter(|run| run.label == k) {
+        for run in self.components.runs_of(k) {
             for column in run.start..run.end {
                 if self.is_of(k, column, run.row) {
                     depths[(run.row - c.top) * width + column - c.left] = MAX_DEPTH;
