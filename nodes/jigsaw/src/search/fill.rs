@@ -27,8 +27,8 @@ const CAP: f64 = 0.05;
 const TURNED: f64 = -0.5;
 /// Part of the border that follows another by which a piece is judged: frays and rounded corners may be off.
 const FOLLOWS: f64 = 0.9;
-/// Part of a piece's border that must have another near: less than a side says little.
-const LEAST_SHARE: f64 = 0.2;
+/// Part of a piece's border that must follow others: more than a side, for what leads to a place fits on one side always.
+const LEAST_SHARE: f64 = 0.4;
 /// Two poses whose centroids are nearer than this, in piece scales, claim the same place.
 const SAME_PLACE: f64 = 0.3;
 /// Adjustments until a pose has settled.
@@ -42,11 +42,31 @@ const SAMPLE: usize = 100;
 const STRANGERS: usize = 400;
 /// Of these the ones whose place is most like another are compared with what is tried there.
 const ALIKE: usize = 100;
+/// So many of those that fit in without overlap, the ones with the most alike places, show what strangers cost.
+const COSTS: usize = 16;
 /// Fewer figures don't show how they spread.
 const FEW: usize = 4;
+/// Strangers fit worse by this much (natural logarithm) if all overlap.
+const STRANGE: f64 = 1.0;
+/// How much of the surroundings is left around a piece that is taken to be away, as the cosine of the angle from one
+/// neighbour: the half plane on its side, all.
+const OPEN: [f64; 2] = [-0.2, -1.0];
 
-/// An island, and the piece of it that is taken to be away.
-type Place = (usize, Option<usize>);
+/// An island, and what of it is taken to be away.
+#[derive(Debug, Clone, Copy)]
+struct Place {
+    island: usize,
+    away: Option<Away>,
+}
+
+/// A piece of an island that is taken to be away, and with it all that lie, as seen from there, in other directions than
+/// one of its neighbours: so many (cosine of the angle between) that the gap is as open as that at a rim.
+#[derive(Debug, Clone, Copy)]
+struct Away {
+    piece: usize,
+    towards: usize,
+    cosine: f64,
+}
 
 /// How badly a piece fits in a place.
 #[derive(Debug, Clone, Copy)]
@@ -75,26 +95,32 @@ struct Trial {
 /// How pieces fit that are placed, and how strangers do in their places.
 #[derive(Debug, Clone)]
 struct Fitting {
-    model: Model,
-    /// How enclosed each stranger was, and whether it fits in without overlap, by the former.
+    /// Mean and deviation of what pieces cost that are placed.
+    right: (f64, f64),
+    /// How enclosed each stranger was, and whether it fits in without overlap; by the former.
     strangers: Vec<(f64, bool)>,
+    /// How enclosed those were that do, and what they cost; by the former.
+    costs: Vec<(f64, f64)>,
 }
 
 impl Fitting {
-    /// Logarithm of the odds that a piece belongs where it is tried.
+    /// Logarithm of the odds that a piece belongs where it is tried: how much likelier its cost is for a piece that is
+    /// placed than for a stranger in a place as enclosed, and how rarely such a one doesn't overlap.
     fn evidence(&self, trial: &Trial) -> f64 {
-        self.model.evidence(trial.misfit.cost) + self.rarity(trial.misfit.share) - (trial.tries.max(1) as f64).ln()
+        let strangers = alike(&self.strangers, trial.misfit.share, ALIKE);
+        let rarity = (strangers.len() + 1) as f64 / (strangers.iter().filter(|s| s.1).count() + 1) as f64;
+        let mut costs: Vec<f64> = alike(&self.costs, trial.misfit.share, COSTS).iter().map(|s| s.1).collect();
+        let wrong = if costs.len() < FEW { (self.right.0 + STRANGE, self.right.1) } else { spread_of(&mut costs) };
+        let model = Model::between(self.right, wrong);
+        model.evidence(trial.misfit.cost) + rarity.ln() - (trial.tries.max(1) as f64).ln()
     }
+}
 
-    /// Logarithm of how rarely a stranger fits into a place as enclosed without overlap.
-    fn rarity(&self, share: f64) -> f64 {
-        let all = self.strangers.len();
-        let before = self.strangers.partition_point(|s| s.0 < share);
-        let first = before.saturating_sub(ALIKE / 2).min(all.saturating_sub(ALIKE));
-        let alike = &self.strangers[first..(first + ALIKE).min(all)];
-        let fitting = alike.iter().filter(|s| s.1).count();
-        ((alike.len() + 1) as f64 / (fitting + 1) as f64).ln()
-    }
+/// About so many of a row of figures as lie around one of them.
+fn alike<T>(sorted: &[(f64, T)], share: f64, count: usize) -> &[(f64, T)] {
+    let before = sorted.partition_point(|s| s.0 < share);
+    let first = before.saturating_sub(count / 2).min(sorted.len().saturating_sub(count));
+    &sorted[first..(first + count).min(sorted.len())]
 }
 
 /// Where a piece's border has another near: place about the centroid, normal of the other border, and gap, clearance
@@ -209,8 +235,8 @@ impl Assembler<'_> {
         kept
     }
 
-    /// A piece of a candidate where the other one says it belongs, as if one piece weren't there.
-    fn trial(&self, edge: usize, piece: usize, without: Option<usize>) -> Option<Trial> {
+    /// A piece of a candidate where the other one says it belongs, as if some pieces weren't there.
+    fn trial(&self, edge: usize, piece: usize, away: Option<Away>) -> Option<Trial> {
         let e = &self.edges[edge];
         let (held, pose) = if piece == e.a {
             (e.b, self.state.pose[e.b] * e.b_from_a)
@@ -218,20 +244,25 @@ impl Assembler<'_> {
             (e.a, self.state.pose[e.a] * e.b_from_a.inverse())
         };
         let island = self.state.island(held);
-        let pose = self.settled(piece, (island, without), pose);
-        let misfit = self.misfit(piece, (island, without), &pose)?;
+        let place = Place { island, away };
+        let pose = self.settled(piece, place, pose);
+        let misfit = self.misfit(piece, place, &pose)?;
         let centre = pose * self.outlines[piece].centroid;
         Some(Trial { piece, edge, island, pose, centre, misfit, tries: 1 })
     }
 
-    /// Pieces of an island, but for one, near enough to touch a piece in a pose.
+    /// Pieces of an island, but for those away, near enough to touch a piece in a pose.
     fn around(&self, piece: usize, place: Place, pose: &Isometry2<f64>) -> Vec<usize> {
-        let (island, without) = place;
         let centre = pose * self.outlines[piece].centroid;
         let reach = self.outlines[piece].radius + NEAR * self.scale;
-        let apart = |q: &usize| *q != piece && Some(*q) != without;
         let near = |q: &usize| (self.centre_of(*q) - centre).norm() <= reach + self.outlines[*q].radius;
-        self.state.members(island).filter(apart).filter(near).collect()
+        let there = |q: &usize| {
+            place.away.is_none_or(|away| {
+                let [to, other] = [away.towards, *q].map(|k| self.centre_of(k) - self.centre_of(away.piece));
+                *q != away.piece && to.dot(&other) >= away.cosine * to.norm() * other.norm()
+            })
+        };
+        self.state.members(place.island).filter(|q| *q != piece).filter(near).filter(there).collect()
     }
 
     /// The pose of a piece adjusted to all contacts with an island, which is held.
@@ -298,14 +329,14 @@ impl Assembler<'_> {
     fn fitting(&self) -> Option<Fitting> {
         /// Nine tenths of a normal distribution lie below its mean and this many deviations.
         const NORMAL_90: f64 = 1.2816;
-        /// Strangers fit worse by this much (natural logarithm) if all overlap.
-        const STRANGE: f64 = 1.0;
         let placed: Vec<usize> = (0..self.outlines.len()).filter(|k| self.state.size(*k) > FEW).collect();
         if placed.len() == self.outlines.len() {
             return None;
         }
         let sample: Vec<usize> = placed.iter().copied().step_by(placed.len().div_ceil(SAMPLE).max(1)).collect();
-        let cost = |k: &usize| Some(self.misfit(*k, (self.state.island(*k), None), &self.state.pose[*k])?.cost);
+        let cost = |k: &usize| {
+            Some(self.misfit(*k, Place { island: self.state.island(*k), away: None }, &self.state.pose[*k])?.cost)
+        };
         let mut right: Vec<f64> = sample.par_iter().filter_map(cost).collect();
         if right.len() < FEW {
             return None;
@@ -322,20 +353,23 @@ impl Assembler<'_> {
                 let others = self.at[held.piece].iter().filter_map(move |j| {
                     let [tab, mouth] = self.edges[*j].slots();
                     let stranger = if tab == held { mouth.piece } else { tab.piece };
-                    ((tab == held || mouth == held) && stranger != piece).then_some((*j, stranger, piece))
+                    ((tab == held || mouth == held) && stranger != piece).then_some((*j, stranger, held.piece, piece))
                 });
-                others.filter(|(_, stranger, _)| !self.aside[*stranger])
+                others.filter(|(_, stranger, ..)| !self.aside[*stranger])
             })
         };
         let large = self.state.joined().iter().filter(|k| self.state.size(self.edges[**k].a) > FEW);
-        let exchanges: Vec<(usize, usize, usize)> = large.flat_map(instead).collect();
+        let exchanges: Vec<(usize, usize, usize, usize)> = large.flat_map(instead).collect();
         let some: Vec<_> = exchanges.iter().step_by(exchanges.len().div_ceil(STRANGERS).max(1)).collect();
-        let tried = some.par_iter().filter_map(|(k, stranger, piece)| self.trial(*k, *stranger, Some(*piece)));
-        let tried: Vec<Misfit> = tried.map(|t| t.misfit).collect();
-        let mut strangers: Vec<(f64, bool)> = tried.iter().map(|m| (m.share, m.overlap <= self.tolerated())).collect();
-        strangers.sort_by(|p, q| p.0.total_cmp(&q.0).then(p.1.cmp(&q.1)));
-        let mut wrong: Vec<f64> = tried.iter().filter(|m| m.overlap <= self.tolerated()).map(|m| m.cost).collect();
-        let wrong = if wrong.len() < FEW { (right.0 + STRANGE, right.1) } else { spread_of(&mut wrong) };
-        Some(Fitting { model: Model::between(right, wrong), strangers })
+        let tried = some.par_iter().enumerate().filter_map(|(n, (k, stranger, held, piece))| {
+            let away = Away { piece: *piece, towards: *held, cosine: OPEN[n % OPEN.len()] };
+            Some(self.trial(*k, *stranger, Some(away))?.misfit)
+        });
+        let mut tried: Vec<Misfit> = tried.collect();
+        tried.sort_by(|p, q| p.share.total_cmp(&q.share).then(p.cost.total_cmp(&q.cost)));
+        let fits = |m: &Misfit| m.overlap <= self.tolerated();
+        let strangers = tried.iter().map(|m| (m.share, fits(m))).collect();
+        let costs = tried.iter().filter(|m| fits(m)).map(|m| (m.share, m.cost)).collect();
+        Some(Fitting { right, strangers, costs })
     }
 }
