@@ -163,9 +163,13 @@ fn unstrained(touches: &[Touch]) -> Vec<f64> {
 impl Assembler<'_> {
     /// Places pieces left over, the best fitting first, as long as some fit like those that are placed.
     pub(super) fn fill(&mut self) {
-        let Some(fitting) = self.fitting() else { return };
+        let mut learnt: Option<Fitting> = None;
         while !self.late() {
             let trials = self.trials();
+            if trials.is_empty() {
+                return;
+            }
+            let Some(fitting) = learnt.take().or_else(|| self.fitting()) else { return };
             let sure = |t: &Trial| {
                 let evidence = fitting.evidence(t);
                 let rivals = trials.iter().filter(|o| (o.piece == t.piece) != self.same_place(o, t));
@@ -192,6 +196,7 @@ impl Assembler<'_> {
             if self.params.pose_graph {
                 islands.into_iter().for_each(|island| self.adjust(island, COARSE));
             }
+            learnt = Some(fitting);
         }
     }
 
@@ -324,15 +329,12 @@ impl Assembler<'_> {
         Some(Misfit { cost: (sum / gaps.len() as f64).max(1e-4).ln(), share, overlap })
     }
 
-    /// How badly pieces fit that are placed, and how badly strangers in their places; `None` where nothing is left over,
-    /// or there is nothing to learn from.
+    /// How badly pieces fit that are placed, and how badly strangers in their places; `None` where there is nothing to
+    /// learn from.
     fn fitting(&self) -> Option<Fitting> {
         /// Nine tenths of a normal distribution lie below its mean and this many deviations.
         const NORMAL_90: f64 = 1.2816;
         let placed: Vec<usize> = (0..self.outlines.len()).filter(|k| self.state.size(*k) > FEW).collect();
-        if placed.len() == self.outlines.len() {
-            return None;
-        }
         let sample: Vec<usize> = placed.iter().copied().step_by(placed.len().div_ceil(SAMPLE).max(1)).collect();
         let cost = |k: &usize| {
             Some(self.misfit(*k, Place { island: self.state.island(*k), away: None }, &self.state.pose[*k])?.cost)
