@@ -2,6 +2,9 @@
 //!
 //! `cargo run --release -p isthmus-shapes --example floor_map [WIDTH_IN_METRES [FILE.png]]`
 
+mod drawing;
+
+use drawing::line;
 use image::{Rgb, RgbImage};
 use isthmus::isthmus::Polarity;
 use isthmus::mask::{Frame, Parameters, segment};
@@ -26,6 +29,11 @@ const FREE: [[u32; 4]; 9] = [
 /// Pixels for a cell in the picture.
 const ZOOM: u32 = 4;
 
+/// The middle of a cell, or a place between cells, in the picture.
+fn zoomed(p: Point) -> Point {
+    Point::from(p.coords.map(|v| (v + 0.5) * f64::from(ZOOM) - 0.5))
+}
+
 fn main() -> Result<(), Box<dyn std::error::Error>> {
     let robot: f64 = std::env::args().nth(1).map_or(Ok(0.6), |a| a.parse())?;
     let file = std::env::args().nth(2).unwrap_or_else(|| "floor_map.png".into());
@@ -39,7 +47,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     for cutout in segment(&Frame::grey(COLUMNS, ROWS, &grid)?, &Parameters::default()).cutouts {
         let features = extractor.extract(&cutout)?;
         for pair in features.endoskeleton.branches.iter().flat_map(|branch| branch.windows(2)) {
-            line(&mut picture, [pair[0].point, pair[1].point], 0, Rgb([86, 140, 230]));
+            line(&mut picture, [pair[0].point, pair[1].point].map(zoomed), 0, Rgb([86, 140, 230]));
         }
         for passage in features.isthmuses.iter().filter(|i| i.polarity == Polarity::Positive) {
             let metres = passage.width * CELL;
@@ -50,31 +58,10 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
                 if passes { "passes" } else { "is stuck" }
             );
             let colour = if passes { Rgb([0, 114, 178]) } else { Rgb([213, 94, 0]) };
-            line(&mut picture, passage.critical_points, 1, colour);
+            line(&mut picture, passage.critical_points.map(zoomed), 1, colour);
         }
     }
     picture.save(&file)?;
     println!("{file}");
     Ok(())
-}
-
-/// Draws a straight line.
-fn line(picture: &mut RgbImage, [p, q]: [Point; 2], reach: i64, colour: Rgb<u8>) {
-    let steps = (f64::from(ZOOM) * (q - p).norm()).ceil().max(1.0);
-    for k in 0..=steps as u32 {
-        mark(picture, p + (q - p) * (f64::from(k) / steps), reach, colour);
-    }
-}
-
-/// Colours the square of picture pixels about a point of the grid.
-fn mark(picture: &mut RgbImage, at: Point, reach: i64, colour: Rgb<u8>) {
-    let zoomed = |v: f64| ((v + 0.5) * f64::from(ZOOM)) as i64;
-    for dy in -reach..=reach {
-        for dx in -reach..=reach {
-            let (x, y) = (zoomed(at.x) + dx, zoomed(at.y) + dy);
-            if (0..i64::from(picture.width())).contains(&x) && (0..i64::from(picture.height())).contains(&y) {
-                picture.put_pixel(x as u32, y as u32, colour);
-            }
-        }
-    }
 }

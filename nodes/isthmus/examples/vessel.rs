@@ -2,6 +2,9 @@
 //!
 //! `cargo run --release -p isthmus-shapes --example vessel [FILE.png]`
 
+mod drawing;
+
+use drawing::line;
 use image::{Rgb, RgbImage};
 use isthmus::isthmus::Polarity;
 use isthmus::mask::{Frame, Parameters, segment};
@@ -55,24 +58,4 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     picture.save(&file)?;
     println!("{file}");
     Ok(())
-}
-
-/// Draws a straight line.
-fn line(picture: &mut RgbImage, [p, q]: [Point; 2], reach: i64, colour: Rgb<u8>) {
-    let steps = ((q - p).norm()).ceil().max(1.0);
-    for k in 0..=steps as u32 {
-        mark(picture, p + (q - p) * (f64::from(k) / steps), reach, colour);
-    }
-}
-
-/// Colours the square of pixels about a point.
-fn mark(picture: &mut RgbImage, at: Point, reach: i64, colour: Rgb<u8>) {
-    for dy in -reach..=reach {
-        for dx in -reach..=reach {
-            let (x, y) = (at.x.round() as i64 + dx, at.y.round() as i64 + dy);
-            if (0..i64::from(picture.width())).contains(&x) && (0..i64::from(picture.height())).contains(&y) {
-                picture.put_pixel(x as u32, y as u32, colour);
-            }
-        }
-    }
 }
