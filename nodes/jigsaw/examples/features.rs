@@ -2,31 +2,48 @@
 //!
 //! `cargo run --release -p jigsaw --example features -- [--seeds FROM..TO] [--only NOISE,BLUR,VIGNETTE] [--verbose]`
 //!
-//! `missed` counts true isthmuses that have no found one of their polarity within [`SAME`] pixels, `superfluous` the found ones that
-//! belong to no true one, for each piece (all / salient). `border` is the signed distance of the border from the true outline,
-//! outwards positive: its mean over all points, and the root mean square about it.
+//! Each piece is taken [`PICTURES`] times with new noise. `missed` counts true isthmuses that have no found one of their polarity within
+//! [`SAME`] pixels, `superfluous` the found ones that belong to no true one, for each picture (all / salient). The *bias* of a middle is its mean
+//! distance from the true one over the pictures, along the tab; its *deviation* is what noise adds. `border` is the signed distance of the border from
+//! the true outline, outwards positive: means of whole borders, and the root mean square of all points about their mean. *Both sides of a joint* is the
+//! sum of the mean distances of its two borders along it, which the clearance of the two pieces is wrong by (mean, deviation, most).
 
 use anyhow::{Context, bail};
 use isthmus::isthmus::Polarity;
 use isthmus::{Point, mask};
 use jigsaw::generate::{Options, Puzzle, SideKind};
+use rand::SeedableRng;
+use rand_chacha::ChaCha8Rng;
+use rand_distr::{Distribution, Normal};
 use rayon::prelude::*;
 
 /// A found isthmus belongs to the true one whose middle is this near, in pixels: less than half the narrowest neck.
 const SAME: f64 = 8.0;
 
 /// Noise (grey levels), blur (pixels) and vignette of the pictures.
-const CASES: [[f64; 3]; 9] = [
+const CASES: [[f64; 3]; 13] = [
     [0.0, 0.0, 0.0],
-    [3.0, 1.0, 0.0],
-    [10.0, 2.0, 0.0],
+    [0.0, 1.5, 0.0],
     [0.0, 4.0, 0.0],
-    [20.0, 1.0, 0.0],
+    [8.0, 0.0, 0.0],
+    [8.0, 1.5, 0.0],
+    [8.0, 4.0, 0.0],
+    [20.0, 0.0, 0.0],
+    [20.0, 1.5, 0.0],
     [20.0, 4.0, 0.0],
+    [8.0, 1.5, 0.5],
     [20.0, 4.0, 0.5],
     [40.0, 1.0, 0.0],
     [40.0, 4.0, 0.0],
 ];
+/// How many times each piece is taken, by pictures that differ in their noise.
+const PICTURES: u64 = 3;
+/// How far beyond a match segment a joint is taken to reach, in pixels: about to the corners of the pieces.
+const BEYOND: f64 = 60.0;
+/// Points of a joint at which its distance from the true outline is taken.
+const JOINT_POINTS: usize = 100;
+/// One in so many points of a border is compared with the true outline.
+const BORDER_STEP: usize = 3;
 
 /// What is measured on pieces.
 #[derive(Debug, Default)]
@@ -42,59 +59,100 @@ struct Score {
     widths: Vec<f64>,
     offsets: Vec<f64>,
     noise: Vec<f64>,
+    /// Mean and standard deviation over the pictures of a piece of a neck's place along its tab.
+    biases: Vec<f64>,
+    deviations: Vec<f64>,
+    /// Mean offset of each whole border.
+    borders: Vec<f64>,
+    /// Joint, picture, and mean offset of the border along it.
+    joints: Vec<((usize, u64), f64)>,
 }
 
 impl Score {
-    fn of(puzzle: &Puzzle, frame: usize, verbose: bool) -> anyhow::Result<Self> {
-        let picture = puzzle.render(frame);
-        let picture = mask::Frame::grey(picture.width, picture.height, &picture.pixels)?;
-        let segmentation = mask::segment(&picture, &mask::Parameters::default());
-        let [cutout] = &segmentation.cutouts[..] else {
-            bail!("{} shapes in frame {frame}: {:?}", segmentation.cutouts.len(), segmentation.rejected)
-        };
-        let features = isthmus::Extractor::default().extract(cutout).with_context(|| format!("frame {frame}"))?;
+    /// The score of a piece; `puzzle` is rendered without noise, which is added here, each time anew.
+    fn of(puzzle: &Puzzle, frame: usize, noise: f64, verbose: bool) -> anyhow::Result<Self> {
+        let clean = puzzle.render(frame);
         let piece = puzzle.pieces().iter().position(|p| p.frame == frame).context("a frame without a piece")?;
-        let mut score = Self { pieces: 1, noise: vec![features.noise], ..Self::default() };
-        let mut used = vec![false; features.isthmuses.len()];
-        for side in puzzle.sides(piece) {
-            let Some(ends) = side.critical_points else { continue };
-            let polarity = if side.kind == SideKind::Tab { Polarity::Positive } else { Polarity::Negative };
-            let middle = nalgebra::center(&ends[0], &ends[1]);
-            let off = |k: &usize| (features.isthmuses[*k].point - middle).norm();
-            let alike = (0..features.isthmuses.len()).filter(|&k| features.isthmuses[k].polarity == polarity);
-            let nearest = alike.min_by(|a, b| off(a).total_cmp(&off(b))).filter(|k| off(k) < SAME);
-            score.necks += 1;
-            let Some(k) = nearest else {
-                score.missed += 1;
-                continue;
-            };
-            used[k] = true;
-            let found = &features.isthmuses[k];
-            score.not_salient += usize::from(!found.salient);
-            score.middle.push(off(&k));
-            score.ends.extend((0..2).map(|e| (found.critical_points[e] - ends[e]).norm()));
-            score.widths.push(found.width - (ends[1] - ends[0]).norm());
-            if verbose {
-                let along = (ends[1] - ends[0]).normalize();
-                let d = found.point - middle;
-                println!(
-                    "  {} {polarity:?}: along the chord {:.2}, across {:.2}, width {:.1} (true {:.1}), persistence {:.1}",
-                    puzzle.pieces()[piece].id,
-                    d.dot(&along),
-                    d.perp(&along),
-                    found.width,
-                    (ends[1] - ends[0]).norm(),
-                    found.persistence,
-                );
-            }
-        }
-        for (found, _) in features.isthmuses.iter().zip(&used).filter(|(_, used)| !**used) {
-            score.superfluous[found.polarity as usize] += 1;
-            score.superfluous[2 + found.polarity as usize] += usize::from(found.salient);
-        }
         let truth = puzzle.outline(piece);
-        score.offsets = features.border.points.iter().map(|p| offset(&truth, *p)).collect();
+        let necks: Vec<(Polarity, [Point; 2], usize)> = puzzle
+            .sides(piece)
+            .into_iter()
+            .filter_map(|side| {
+                let polarity = if side.kind == SideKind::Tab { Polarity::Positive } else { Polarity::Negative };
+                side.critical_points.map(|ends| (polarity, ends, side.joint))
+            })
+            .collect();
+        let mut score = Self::default();
+        let mut along_tab = vec![Vec::new(); necks.len()];
+        let normal = Normal::new(0.0, noise as f32)?;
+        for picture in 0..PICTURES {
+            let mut rng = ChaCha8Rng::seed_from_u64(frame as u64 * PICTURES + picture);
+            let noisy = |p: &u8| (f32::from(*p) + normal.sample(&mut rng)).round().clamp(0.0, 255.0) as u8;
+            let pixels: Vec<u8> = clean.pixels.iter().map(noisy).collect();
+            let segmentation =
+                mask::segment(&mask::Frame::grey(clean.width, clean.height, &pixels)?, &mask::Parameters::default());
+            let [cutout] = &segmentation.cutouts[..] else {
+                bail!("{} shapes in frame {frame}: {:?}", segmentation.cutouts.len(), segmentation.rejected)
+            };
+            let features = isthmus::Extractor::default().extract(cutout).with_context(|| format!("frame {frame}"))?;
+            score.pieces += 1;
+            score.noise.push(features.noise);
+            let mut used = vec![false; features.isthmuses.len()];
+            for ((polarity, ends, joint), along_tab) in necks.iter().zip(&mut along_tab) {
+                let middle = nalgebra::center(&ends[0], &ends[1]);
+                let off = |k: &usize| (features.isthmuses[*k].point - middle).norm();
+                let alike = (0..used.len()).filter(|&k| features.isthmuses[k].polarity == *polarity);
+                let nearest = alike.min_by(|a, b| off(a).total_cmp(&off(b))).filter(|k| off(k) < SAME);
+                score.necks += 1;
+                let Some(k) = nearest else {
+                    score.missed += 1;
+                    continue;
+                };
+                used[k] = true;
+                let found = &features.isthmuses[k];
+                let across = (ends[1] - ends[0]).normalize();
+                let d = found.point - middle;
+                along_tab.push(d.perp(&across));
+                score.not_salient += usize::from(!found.salient);
+                score.middle.push(d.norm());
+                score.ends.extend((0..2).map(|e| (found.critical_points[e] - ends[e]).norm()));
+                score.widths.push(found.width - (ends[1] - ends[0]).norm());
+                let points = features.border.sample(found.arc, BEYOND, JOINT_POINTS);
+                let offsets: Vec<f64> = points.iter().map(|p| offset(&truth, *p)).collect();
+                score.joints.push(((*joint, picture), mean(&offsets)));
+                if verbose {
+                    println!(
+                        "  {} {polarity:?}: along the chord {:.2}, along the tab {:.2}, width {:.1} (true {:.1}), persistence {:.1}",
+                        puzzle.pieces()[piece].id,
+                        d.dot(&across),
+                        d.perp(&across),
+                        found.width,
+                        (ends[1] - ends[0]).norm(),
+                        found.persistence,
+                    );
+                }
+            }
+            for (found, _) in features.isthmuses.iter().zip(&used).filter(|(_, used)| !**used) {
+                score.superfluous[found.polarity as usize] += 1;
+                score.superfluous[2 + found.polarity as usize] += usize::from(found.salient);
+            }
+            let points = features.border.points.iter().step_by(BORDER_STEP);
+            let offsets: Vec<f64> = points.map(|p| offset(&truth, *p)).collect();
+            score.borders.push(mean(&offsets));
+            score.offsets.extend(offsets);
+        }
+        for along_tab in along_tab.iter().filter(|a| a.len() == PICTURES as usize) {
+            score.biases.push(mean(along_tab).abs());
+            // Of as many pictures, the mean already follows the noise.
+            score.deviations.push(deviation(along_tab) * (PICTURES as f64 / (PICTURES as f64 - 1.0)).sqrt());
+        }
         Ok(score)
+    }
+
+    /// What the two sides of each joint are off by together.
+    fn close_joints(&mut self) -> Vec<f64> {
+        self.joints.sort_by_key(|(key, _)| *key);
+        self.joints.chunk_by(|a, b| a.0 == b.0).filter(|c| c.len() == 2).map(|c| c[0].1 + c[1].1).collect()
     }
 
     fn add(&mut self, other: Self) {
@@ -110,6 +168,10 @@ impl Score {
         self.widths.extend(other.widths);
         self.offsets.extend(other.offsets);
         self.noise.extend(other.noise);
+        self.biases.extend(other.biases);
+        self.deviations.extend(other.deviations);
+        self.borders.extend(other.borders);
+        self.joints.extend(other.joints);
     }
 }
 
@@ -137,6 +199,17 @@ fn mean(values: &[f64]) -> f64 {
     values.iter().sum::<f64>() / values.len().max(1) as f64
 }
 
+fn deviation(values: &[f64]) -> f64 {
+    let centre = mean(values);
+    mean(&values.iter().map(|v| (v - centre).powi(2)).collect::<Vec<_>>()).sqrt()
+}
+
+/// Mean, standard deviation and most.
+fn scatter(values: &[f64]) -> String {
+    let most = values.iter().fold(0.0, |most: f64, v| most.max(v.abs()));
+    format!("{:+.3} {:.3} {most:.2}", mean(values), deviation(values))
+}
+
 fn main() -> anyhow::Result<()> {
     let mut seeds = 1..4u64;
     let mut cases = CASES.to_vec();
@@ -159,24 +232,26 @@ fn main() -> anyhow::Result<()> {
         }
     }
     println!(
-        "| noise, blur, vignette | pieces | missed | not salient | superfluous + | - | middle (median, 95 %, most) | ends | width | border mean | rms | noise said |"
+        "| noise, blur, vignette | pictures | missed | not salient | superfluous + | - | middle (median, 95 %, most) | its bias | its deviation | ends | width | border (mean, deviation, most) | rms | said | both sides of a joint |"
     );
-    println!("|{}", " --- |".repeat(12));
+    println!("|{}", " --- |".repeat(15));
     for [noise, blur, vignette] in cases {
         let mut total = Score::default();
+        let mut joints = Vec::new();
         for seed in seeds.clone() {
-            let puzzle = Puzzle::generate(&Options { seed, noise, blur, vignette, ..Options::default() })?;
+            let puzzle = Puzzle::generate(&Options { seed, blur, vignette, ..Options::default() })?;
             let scores: Vec<anyhow::Result<Score>> =
-                (0..puzzle.frame_count()).into_par_iter().map(|k| Score::of(&puzzle, k, verbose)).collect();
+                (0..puzzle.frame_count()).into_par_iter().map(|k| Score::of(&puzzle, k, noise, verbose)).collect();
             for score in scores {
                 total.add(score.with_context(|| format!("seed {seed}"))?);
             }
+            // Joints are numbered in each puzzle.
+            joints.extend(total.close_joints());
+            total.joints.clear();
         }
         let rate = |k: usize| total.superfluous[k] as f64 / total.pieces.max(1) as f64;
-        let centre = mean(&total.offsets);
-        let rms = mean(&total.offsets.iter().map(|o| (o - centre).powi(2)).collect::<Vec<_>>()).sqrt();
         println!(
-            "| {noise}, {blur}, {vignette} | {} | {} of {} | {} | {:.2} / {:.2} | {:.2} / {:.2} | {} | {} | {:+.2} | {centre:+.3} | {rms:.3} | {:.3} |",
+            "| {noise}, {blur}, {vignette} | {} | {} of {} | {} | {:.2} / {:.2} | {:.2} / {:.2} | {} | {} | {} | {} | {:+.2} | {} | {:.3} | {:.3} | {} |",
             total.pieces,
             total.missed,
             total.necks,
@@ -186,9 +261,14 @@ fn main() -> anyhow::Result<()> {
             rate(1),
             rate(3),
             spread(&total.middle),
+            spread(&total.biases),
+            spread(&total.deviations),
             spread(&total.ends),
             mean(&total.widths),
+            scatter(&total.borders),
+            deviation(&total.offsets),
             mean(&total.noise),
+            scatter(&joints),
         );
     }
     Ok(())
