@@ -32,86 +32,23 @@ pub(crate) fn turned(rotation: UnitComplex<f64>) -> Matrix3<f64> {
 
 /// Motions (x, y, turn about the reference point) of all nodes that minimise the sum of the factors.
 pub(crate) fn minimise(references: &[Point2<f64>], factors: &[Factor]) -> Vec<Vector3<f64>> {
-    let n = references.len();
-    let Elimination { order, place, mut rows } = Elimination::new(n, factors);
-    // From here on nodes go by their place in the order.
-    let mut pivots = vec![Matrix3::zeros(); n];
-    let mut right = vec![Vector3::zeros(); n];
-    let mut weight = 0.0f64;
-    for f in factors {
-        let (ja, jb) = (lever(references[f.a], f.centre), lever(references[f.b], f.centre));
-        let (ha, hb) = (ja.transpose() * f.hessian, jb.transpose() * f.hessian);
-        let (a, b) = (place[f.a], place[f.b]);
-        pivots[a] += ha * ja;
-        pivots[b] += hb * jb;
-        let (first, second, block) = if a < b { (a, b, ha * jb) } else { (b, a, hb * ja) };
-        if let Ok(k) = rows[first].binary_search_by_key(&second, |r| r.0) {
-            rows[first][k].1 -= block;
-        }
-        right[a] -= ja.transpose() * f.gradient;
-        right[b] += jb.transpose() * f.gradient;
-        weight = weight.max(f.hessian.diagonal().max());
-    }
-    // Gauge: the first node of each connected part is held; a trace of damping on the rest for slack contacts.
-    for root in roots(n, factors) {
-        pivots[place[root]] += Matrix3::identity() * (1e6 * weight.max(1.0));
-    }
-    let damping = Matrix3::identity() * (1e-9 * weight.max(1e-9));
-    for k in 0..n {
-        let inverse = (pivots[k] + damping).try_inverse().unwrap_or_default();
-        pivots[k] = inverse;
-        let row = std::mem::take(&mut rows[k]);
-        for (at, (i, block)) in row.iter().enumerate() {
-            let scaled = block.transpose() * inverse;
-            pivots[*i] -= scaled * block;
-            let pivot_right = right[k];
-            right[*i] -= scaled * pivot_right;
-            // The rest of this row is among the blocks of that one; both are in order.
-            let mut others = rows[*i].iter_mut();
-            for (j, other) in &row[at + 1..] {
-                if let Some((_, fill)) = others.find(|o| o.0 == *j) {
-                    *fill -= scaled * other;
-                }
-            }
-        }
-        rows[k] = row;
-    }
-    let mut motion = vec![Vector3::zeros(); n];
-    for k in (0..n).rev() {
-        let sum = rows[k].iter().fold(right[k], |sum, (j, block)| sum - block * motion[order[*j]]);
-        motion[order[k]] = pivots[k] * sum;
-    }
-    motion
+    Plan::new(references.len(), factors).minimise(references, factors)
 }
 
-/// The least node of each part that factors connect.
-fn roots(n: usize, factors: &[Factor]) -> Vec<usize> {
-    let mut parts: Vec<usize> = (0..n).collect();
-    let root = |parts: &mut Vec<usize>, mut k: usize| {
-        while parts[k] != k {
-            parts[k] = parts[parts[k]];
-            k = parts[k];
-        }
-        k
-    };
-    for f in factors {
-        let (a, b) = (root(&mut parts, f.a), root(&mut parts, f.b));
-        parts[a.max(b)] = a.min(b);
-    }
-    (0..n).filter(|k| parts[*k] == *k).collect()
-}
-
-/// In which order nodes are eliminated, and between which of them blocks then stand.
-struct Elimination {
+/// In which order nodes are eliminated, and between which of them blocks then stand: a matter of which nodes factors
+/// connect, not of what they say, so that it serves as long as no others are connected.
+#[derive(Debug, Clone)]
+pub(crate) struct Plan {
     order: Vec<usize>,
     /// Place of each node in the order.
     place: Vec<usize>,
-    /// For each place the later places with a block in common, in order; the blocks are zero.
-    rows: Vec<Vec<(usize, Matrix3<f64>)>>,
+    /// For each place where its row of blocks begins, and for each block the later place, in order.
+    starts: Vec<usize>,
+    columns: Vec<usize>,
 }
 
-impl Elimination {
-    fn new(n: usize, factors: &[Factor]) -> Self {
+impl Plan {
+    pub(crate) fn new(n: usize, factors: &[Factor]) -> Self {
         let mut around: Vec<Vec<usize>> = vec![Vec::new(); n];
         for f in factors.iter().filter(|f| f.a != f.b) {
             around[f.a].push(f.b);
@@ -142,16 +79,99 @@ impl Elimination {
             }
             later.push(near);
         }
-        let rows = later
-            .into_iter()
-            .map(|near| {
-                let mut row: Vec<(usize, Matrix3<f64>)> = near.iter().map(|j| (place[*j], Matrix3::zeros())).collect();
-                row.sort_unstable_by_key(|r| r.0);
-                row
-            })
-            .collect();
-        Self { order, place, rows }
+        let (mut starts, mut columns) = (vec![0], Vec::new());
+        for mut row in later {
+            row.iter_mut().for_each(|j| *j = place[*j]);
+            row.sort_unstable();
+            columns.extend(row);
+            starts.push(columns.len());
+        }
+        Self { order, place, starts, columns }
     }
+
+    /// Whether the plan was made for as many nodes, and has a block for each of the factors.
+    pub(crate) fn suits(&self, n: usize, factors: &[Factor]) -> bool {
+        self.order.len() == n && factors.iter().all(|f| f.a == f.b || self.block(f).is_some())
+    }
+
+    /// Where the block between the nodes of a factor stands.
+    fn block(&self, factor: &Factor) -> Option<usize> {
+        let (a, b) = (self.place[factor.a], self.place[factor.b]);
+        let (first, second) = (a.min(b), a.max(b));
+        let row = &self.columns[self.starts[first]..self.starts[first + 1]];
+        row.binary_search(&second).ok().map(|k| self.starts[first] + k)
+    }
+
+    /// As [`minimise`], for factors that the plan suits.
+    pub(crate) fn minimise(&self, references: &[Point2<f64>], factors: &[Factor]) -> Vec<Vector3<f64>> {
+        let n = self.order.len();
+        // From here on nodes go by their place in the order.
+        let mut pivots = vec![Matrix3::zeros(); n];
+        let mut right = vec![Vector3::zeros(); n];
+        let mut blocks = vec![Matrix3::zeros(); self.columns.len()];
+        let row = |k: usize| self.starts[k]..self.starts[k + 1];
+        let mut weight = 0.0f64;
+        for f in factors {
+            let (ja, jb) = (lever(references[f.a], f.centre), lever(references[f.b], f.centre));
+            let (ha, hb) = (ja.transpose() * f.hessian, jb.transpose() * f.hessian);
+            let (a, b) = (self.place[f.a], self.place[f.b]);
+            pivots[a] += ha * ja;
+            pivots[b] += hb * jb;
+            if let Some(k) = self.block(f) {
+                blocks[k] -= if a < b { ha * jb } else { hb * ja };
+            }
+            right[a] -= ja.transpose() * f.gradient;
+            right[b] += jb.transpose() * f.gradient;
+            weight = weight.max(f.hessian.diagonal().max());
+        }
+        // Gauge: the first node of each connected part is held; a trace of damping on the rest for slack contacts.
+        for root in roots(n, factors) {
+            pivots[self.place[root]] += Matrix3::identity() * (1e6 * weight.max(1.0));
+        }
+        let damping = Matrix3::identity() * (1e-9 * weight.max(1e-9));
+        for k in 0..n {
+            let inverse = (pivots[k] + damping).try_inverse().unwrap_or_default();
+            pivots[k] = inverse;
+            let pivot_right = right[k];
+            for at in row(k) {
+                let (i, block) = (self.columns[at], blocks[at]);
+                let scaled = block.transpose() * inverse;
+                pivots[i] -= scaled * block;
+                right[i] -= scaled * pivot_right;
+                // The rest of this row is among the blocks of that one; both are in order.
+                let mut others = row(i);
+                for rest in at + 1..self.starts[k + 1] {
+                    if let Some(other) = others.find(|other| self.columns[*other] == self.columns[rest]) {
+                        let fill = scaled * blocks[rest];
+                        blocks[other] -= fill;
+                    }
+                }
+            }
+        }
+        let mut motion = vec![Vector3::zeros(); n];
+        for k in (0..n).rev() {
+            let known = row(k).map(|at| blocks[at] * motion[self.order[self.columns[at]]]);
+            motion[self.order[k]] = pivots[k] * known.fold(right[k], |sum, known| sum - known);
+        }
+        motion
+    }
+}
+
+/// The least node of each part that factors connect.
+fn roots(n: usize, factors: &[Factor]) -> Vec<usize> {
+    let mut parts: Vec<usize> = (0..n).collect();
+    let root = |parts: &mut Vec<usize>, mut k: usize| {
+        while parts[k] != k {
+            parts[k] = parts[parts[k]];
+            k = parts[k];
+        }
+        k
+    };
+    for f in factors {
+        let (a, b) = (root(&mut parts, f.a), root(&mut parts, f.b));
+        parts[a.max(b)] = a.min(b);
+    }
+    (0..n).filter(|k| parts[*k] == *k).collect()
 }
 
 /// The union of two lists in order.

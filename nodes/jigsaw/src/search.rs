@@ -20,7 +20,7 @@ use crate::loops::{self, Closure, Edge, Said, Slot, Tolerance, conflict, differe
 use crate::outline::Outline;
 use crate::params::Budget;
 use crate::placement::Joint;
-use crate::posegraph::{Factor, minimise, turned};
+use crate::posegraph::{Factor, Plan, turned};
 use crate::{Params, Policy, placement};
 use nalgebra::{Isometry2, Matrix3, Point2, Translation2, UnitComplex, Vector2, Vector3};
 use state::{Slots, State};
@@ -148,6 +148,8 @@ struct Assembler<'a> {
     aside: Vec<bool>,
     slots: Slots,
     state: State,
+    /// How the last island that was adjusted is eliminated: the next one is often the same.
+    plan: Option<Plan>,
     backtracks: usize,
     partial: bool,
 }
@@ -207,6 +209,7 @@ pub(crate) fn assemble(
         aside: vec![false; n],
         state: State::new(&slots),
         slots,
+        plan: None,
         backtracks: 0,
         partial: false,
     };
@@ -376,10 +379,11 @@ impl Assembler<'_> {
     /// among more. The best come first; what is more likely chance is left out.
     fn close_loops(&mut self, joints: &[Joint]) -> Vec<loops::Loop> {
         self.closure = self.first_guess();
+        let ways = self.ways(FIRST_RANKS);
+        let decoys = ways.close_decoys();
         if self.params.recalibrate {
-            let ways = self.ways(FIRST_RANKS);
             let mut first = ways.close();
-            self.closure = self.weigh(&ways, &mut first);
+            self.closure = self.weigh(&decoys, &mut first);
             let sure = first.iter().filter(|l| l.evidence >= FOUND);
             let mut supported: Vec<usize> = sure.flat_map(|l| l.edges.iter().copied()).collect();
             supported.sort_unstable();
@@ -392,10 +396,10 @@ impl Assembler<'_> {
         let all = self.ways(LOOP_RANKS);
         let among = |l: &loops::Loop| l.edges.iter().all(|k| self.among(*k, FIRST_RANKS));
         let (mut best, others): (Vec<loops::Loop>, Vec<loops::Loop>) = all.close().into_iter().partition(among);
-        self.weigh(&self.ways(FIRST_RANKS), &mut best);
+        self.weigh(&decoys, &mut best);
         let mut found = best;
         found.extend(others);
-        self.closure = self.weigh(&all, &mut found);
+        self.closure = self.weigh(&all.close_decoys(), &mut found);
         self.sorted(found)
     }
 
@@ -410,10 +414,9 @@ impl Assembler<'_> {
         loops::Ways::new(&self.edges, &active, self.outlines, LOOSE)
     }
 
-    /// How the loops along some ways close, beside those of decoys; gives each loop the evidence that follows, unless it
-    /// has more already.
-    fn weigh(&self, ways: &loops::Ways, found: &mut [loops::Loop]) -> Closure {
-        let closure = Closure::fit(&self.first_guess(), found, &ways.close_decoys());
+    /// How loops close, beside those of decoys; gives each loop the evidence that follows, unless it has more already.
+    fn weigh(&self, decoys: &loops::Decoys, found: &mut [loops::Loop]) -> Closure {
+        let closure = Closure::fit(&self.first_guess(), found, decoys);
         for l in found {
             l.evidence = l.evidence.max(closure.evidence(l.distance));
         }
@@ -713,9 +716,9 @@ impl Assembler<'_> {
         if members.len() < 2 {
             return;
         }
-        let mut place = HashMap::new();
+        let mut place = vec![0; self.outlines.len()];
         for (i, k) in members.iter().enumerate() {
-            place.insert(*k, i);
+            place[*k] = i;
         }
         let references: Vec<Point2<f64>> =
             members.iter().map(|k| self.state.pose[*k] * self.outlines[*k].centroid).collect();
@@ -725,10 +728,13 @@ impl Assembler<'_> {
             .par_iter()
             .filter_map(|&(p, q)| {
                 let poses = [self.state.pose[p], self.state.pose[q]];
-                self.factor((p, place[&p]), (q, place[&q]), &poses, step)
+                self.factor((p, place[p]), (q, place[q]), &poses, step)
             })
             .collect();
-        let motion = minimise(&references, &factors);
+        let plan = self.plan.take().filter(|plan| plan.suits(members.len(), &factors));
+        let plan = plan.unwrap_or_else(|| Plan::new(members.len(), &factors));
+        let motion = plan.minimise(&references, &factors);
+        self.plan = Some(plan);
         for (i, &k) in members.iter().enumerate() {
             let m = motion[i];
             // A step beyond this isn't an adjustment; it would mean that the contacts were wrong.
