@@ -28,8 +28,10 @@ pub(crate) fn lay_out(
     islands
         .iter()
         .map(|members| {
-            let turn = upright(outlines, poses, members);
-            let (low, high) = bounds(outlines, poses, members, &turn);
+            let points = members.iter().flat_map(|k| outlines[*k].hull.iter().map(move |p| poses[*k] * p));
+            let hull = convex_hull(points.collect());
+            let turn = upright(outlines, poses, members, &hull);
+            let (low, high) = bounds(&hull, &turn);
             let motion = Isometry2::from_parts(Translation2::new(left - low.x, -low.y), turn);
             left += high.x - low.x + outlines[members[0]].scale;
             (members.clone(), motion)
@@ -37,36 +39,22 @@ pub(crate) fn lay_out(
         .collect()
 }
 
-fn bounds(
-    outlines: &[&Outline],
-    poses: &[Isometry2<f64>],
-    members: &[usize],
-    turn: &UnitComplex<f64>,
-) -> (Vector2<f64>, Vector2<f64>) {
-    let mut low = Vector2::repeat(f64::INFINITY);
-    let mut high = Vector2::repeat(f64::NEG_INFINITY);
-    for &k in members {
-        for p in &outlines[k].hull {
-            let p = turn * (poses[k] * p);
-            low = low.inf(&p.coords);
-            high = high.sup(&p.coords);
-        }
-    }
-    (low, high)
+/// Least and greatest coordinates of turned points.
+fn bounds(points: &[Point], turn: &UnitComplex<f64>) -> (Vector2<f64>, Vector2<f64>) {
+    let nothing = (Vector2::repeat(f64::INFINITY), Vector2::repeat(f64::NEG_INFINITY));
+    points.iter().map(|p| turn * p.coords).fold(nothing, |(low, high), p| (low.inf(&p), high.sup(&p)))
 }
 
-fn upright(outlines: &[&Outline], poses: &[Isometry2<f64>], members: &[usize]) -> UnitComplex<f64> {
-    let points: Vec<Point> =
-        members.iter().flat_map(|k| outlines[*k].hull.iter().map(move |p| poses[*k] * p)).collect();
-    let hull = convex_hull(points);
+/// The turn that lays an island with this hull down straight.
+fn upright(outlines: &[&Outline], poses: &[Isometry2<f64>], members: &[usize], hull: &[Point]) -> UnitComplex<f64> {
     let perimeter: f64 = (0..hull.len()).map(|i| (hull[(i + 1) % hull.len()] - hull[i]).norm()).sum();
     let edges: Vec<Vector2<f64>> = members
         .iter()
         .flat_map(|k| outlines[*k].straights.iter().map(move |s| poses[*k] * s.to - poses[*k] * s.from))
         .collect();
-    let angle = straight_direction(&edges, perimeter).unwrap_or_else(|| least_rectangle(&hull));
+    let angle = straight_direction(&edges, perimeter).unwrap_or_else(|| least_rectangle(hull));
     let mut turn = UnitComplex::new(-angle);
-    let (low, high) = bounds(outlines, poses, members, &turn);
+    let (low, high) = bounds(hull, &turn);
     let size = high - low;
     let square = (size.x - size.y).abs() <= SQUARE * size.x.max(size.y);
     if !square && size.y > size.x {

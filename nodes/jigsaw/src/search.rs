@@ -280,8 +280,10 @@ impl Assembler<'_> {
             self.grow();
             self.verify();
         }
-        self.refine_all(1, FINE);
-        self.fill();
+        if (0..self.outlines.len()).any(|k| self.state.alone(k)) {
+            self.refine_all(1, FINE);
+            self.fill();
+        }
         self.refine_all(FINAL_ROUNDS, FINE);
         self.finish_sure(joints)
     }
