@@ -7,8 +7,9 @@ use super::standing::{MAX_DEPTH, Standing};
 /// Most spread of the shape's level (between its quartiles, noise aside), as a part of the contrast, at which the pixels are cut out
 /// as they are: the contour half-way moves by a thirtieth of the edge's blur at most.
 const UNIFORM: f32 = 0.06;
-/// Most difference of the ground's level round a shape, as a part of the contrast, at which the pixels are cut out as they are.
-const UNIFORM_GROUND: f32 = 0.06;
+/// Most difference of the ground's level round a shape, as a part of the contrast, at which the pixels are cut out as they are: half of it
+/// either way moves the contour half-way by a fiftieth of the edge's blur, and all of a side alike.
+const UNIFORM_GROUND: f32 = 0.03;
 /// Depth of the blocks all of whose neighbours belong to the shape.
 const INNER_DEPTH: u8 = 2;
 /// How deep within a shape its level is measured, as a part of the square root of its area: few blocks of it lie deeper in its tabs, and
