@@ -280,7 +280,7 @@ impl Assembler<'_> {
             self.grow();
             self.verify();
         }
-        if (0..self.outlines.len()).any(|k| self.state.alone(k)) {
+        if self.state.largest() < self.outlines.len() {
             self.refine_all(1, FINE);
             self.fill();
         }

@@ -13,7 +13,7 @@
 //! Complexity O(pieces left · candidates · neighbours · border) in each round; a round places all that are sure. A piece
 //! that touches the assembly nowhere, or that strangers equal, stays left over.
 
-use super::{ACCEPT, Assembler, COARSE, Model, spread_of};
+use super::{ACCEPT, Assembler, COARSE, Model, STRAY_SHARE, spread_of};
 use crate::posegraph::{Factor, minimise};
 use isthmus::Point;
 use nalgebra::{Isometry2, Matrix6, Translation2, UnitComplex, Vector2, Vector6};
@@ -42,8 +42,12 @@ const SAMPLE: usize = 100;
 const STRANGERS: usize = 400;
 /// Of these the ones whose place is most like another are compared with what is tried there.
 const ALIKE: usize = 100;
-/// So many of those that fit in without overlap, the ones with the most alike places, show what strangers cost.
-const COSTS: usize = 16;
+/// So many of those that fit in without overlap, the ones with the most alike places, show what strangers cost...
+const COSTS: usize = 48;
+/// ... by the best of them, one in so many: it is these that a wrong piece would be one of.
+const BEST: usize = 3;
+/// A piece whose cost is this many deviations above that of placed ones fits like none of them.
+const UNLIKE: f64 = 4.0;
 /// Fewer figures don't show how they spread.
 const FEW: usize = 4;
 /// Strangers fit worse by this much (natural logarithm) if all overlap.
@@ -109,7 +113,12 @@ impl Fitting {
     fn evidence(&self, trial: &Trial) -> f64 {
         let strangers = alike(&self.strangers, trial.misfit.share, ALIKE);
         let rarity = (strangers.len() + 1) as f64 / (strangers.iter().filter(|s| s.1).count() + 1) as f64;
+        if trial.misfit.cost > self.right.0 + UNLIKE * self.right.1 {
+            return f64::NEG_INFINITY;
+        }
         let mut costs: Vec<f64> = alike(&self.costs, trial.misfit.share, COSTS).iter().map(|s| s.1).collect();
+        costs.sort_by(f64::total_cmp);
+        costs.truncate(costs.len().div_ceil(BEST));
         let wrong = if costs.len() < FEW { (self.right.0 + STRANGE, self.right.1) } else { spread_of(&mut costs) };
         let model = Model::between(self.right, wrong);
         model.evidence(trial.misfit.cost) + rarity.ln() - (trial.tries.max(1) as f64).ln()
@@ -161,15 +170,42 @@ fn unstrained(touches: &[Touch]) -> Vec<f64> {
 }
 
 impl Assembler<'_> {
-    /// Places pieces left over, the best fitting first, as long as some fit like those that are placed.
+    /// Places pieces left over. Islands that are small beside the largest and whose candidates contradict (strained pieces
+    /// are off by more than others) are then taken apart and laid down piece by piece, if all find a place so.
     pub(super) fn fill(&mut self) {
-        let mut learnt: Option<Fitting> = None;
+        let mut fitting = None;
+        self.fill_alone(&mut fitting);
+        let most = self.state.largest() / STRAY_SHARE;
+        let mut small: Vec<usize> =
+            self.state.islands().filter(|k| (2..=most).contains(&self.state.size(*k))).collect();
+        small.sort_by_key(|k| self.state.size(*k));
+        for island in small {
+            // What has been placed meanwhile may have joined it.
+            let island = self.state.island(island);
+            if self.state.size(island) > most || self.backtracks >= self.params.backtracks || self.late() {
+                continue;
+            }
+            let saved = self.state.clone();
+            let members: Vec<usize> = self.state.members(island).collect();
+            self.detach(&members, &[]);
+            self.fill_alone(&mut fitting);
+            if members.into_iter().any(|k| self.state.alone(k)) {
+                self.state = saved;
+                self.backtracks += 1;
+            }
+        }
+    }
+
+    /// Places single pieces, the best fitting first, as long as some fit like those that are placed. How these do is learnt
+    /// where it is not known yet.
+    fn fill_alone(&mut self, learnt: &mut Option<Fitting>) {
         while !self.late() {
             let trials = self.trials();
             if trials.is_empty() {
                 return;
             }
             let Some(fitting) = learnt.take().or_else(|| self.fitting()) else { return };
+            let fitting = &*learnt.insert(fitting);
             let sure = |t: &Trial| {
                 let evidence = fitting.evidence(t);
                 let rivals = trials.iter().filter(|o| (o.piece == t.piece) != self.same_place(o, t));
@@ -196,7 +232,6 @@ impl Assembler<'_> {
             if self.params.pose_graph {
                 islands.into_iter().for_each(|island| self.adjust(island, COARSE));
             }
-            learnt = Some(fitting);
         }
     }
 
