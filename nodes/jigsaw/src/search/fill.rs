@@ -9,11 +9,12 @@
 //! 3. *Decision*: how large that figure is for pieces that are placed, and for strangers in the places of such, is
 //!    measured, and how many strangers overlap so much that they drop out, the more the more the place is enclosed; a
 //!    piece is placed if it fits like one of the former, given how many places were tried for it, and leads its rivals.
+//! 4. *Small islands* that would not join are taken apart and filled in likewise, all of their pieces or none.
 //!
 //! Complexity O(pieces left · candidates · neighbours · border) in each round; a round places all that are sure. A piece
 //! that touches the assembly nowhere, or that strangers equal, stays left over.
 
-use super::{ACCEPT, Assembler, COARSE, Model, STRAY_SHARE, spread_of};
+use super::{Assembler, COARSE, FOUND, Model, STRAY_SHARE, spread_of};
 use crate::posegraph::{Factor, minimise};
 use isthmus::Point;
 use nalgebra::{Isometry2, Matrix6, Translation2, UnitComplex, Vector2, Vector6};
@@ -45,7 +46,7 @@ const ALIKE: usize = 100;
 /// So many of those that fit in without overlap, the ones with the most alike places, show what strangers cost...
 const COSTS: usize = 48;
 /// ... by the best of them, one in so many: it is these that a wrong piece would be one of.
-const BEST: usize = 3;
+const BEST: usize = 2;
 /// A piece whose cost is this many deviations above that of placed ones fits like none of them.
 const UNLIKE: f64 = 4.0;
 /// Fewer figures don't show how they spread.
@@ -210,7 +211,7 @@ impl Assembler<'_> {
                 let evidence = fitting.evidence(t);
                 let rivals = trials.iter().filter(|o| (o.piece == t.piece) != self.same_place(o, t));
                 let lead = rivals.map(|o| evidence - fitting.evidence(o)).fold(f64::INFINITY, f64::min);
-                (evidence.min(lead) >= ACCEPT).then_some((evidence, *t))
+                (evidence.min(lead) >= FOUND).then_some((evidence, *t))
             };
             let mut sure: Vec<(f64, Trial)> = trials.iter().filter_map(sure).collect();
             sure.sort_by(|p, q| q.0.total_cmp(&p.0).then(p.1.edge.cmp(&q.1.edge)));
@@ -219,7 +220,7 @@ impl Assembler<'_> {
                 // What has been placed beside it meanwhile has a say.
                 let now = self.trial(t.edge, t.piece, None).filter(|now| now.misfit.overlap <= self.tolerated());
                 let now = now.map(|now| Trial { tries: t.tries, ..now }).map(|now| (fitting.evidence(&now), now));
-                let Some((evidence, now)) = now.filter(|now| now.0 >= ACCEPT && self.free(t.edge)) else { continue };
+                let Some((evidence, now)) = now.filter(|now| now.0 >= FOUND && self.free(t.edge)) else { continue };
                 self.place(&now, evidence);
                 islands.push(now.island);
             }
