@@ -184,3 +184,32 @@ fn what_is_less_sure_than_asked_for_stays_out() {
     assert!(all.matings.iter().all(|m| m.confidence >= Params::default().minimum_confidence));
     assert!(assembly.matings.len() <= all.matings.len());
 }
+
+/// A piece as a camera sees it that measures its axes differently (`[x, y]`, negative: in a mirror).
+fn scaled(piece: &Piece, scale: [f64; 2]) -> Piece {
+    let mut border = piece.features.border.clone();
+    border.points.iter_mut().for_each(|p| (p.x, p.y) = (scale[0] * p.x, scale[1] * p.y));
+    if scale[0] * scale[1] < 0.0 {
+        border.points.reverse();
+    }
+    let noise = piece.features.noise;
+    Piece { id: piece.id.clone(), features: isthmus::Features::from_border(border, noise).expect("a border") }
+}
+
+/// Scanners stretch what they scan: a piece that is off by 2 % is laid where its whole border fits, but its mirror image
+/// stays left over.
+#[test]
+fn a_strained_piece_is_filled_in_and_a_mirrored_one_is_not() {
+    for seed in 51..54 {
+        let options = Options { seed, noise: 10.0, blur: 2.0, ..Options::default() };
+        let puzzle = Puzzle::generate(&options).expect("valid options");
+        let seen = puzzle.seen().expect("pieces in their frames");
+        for (scale, placed) in [([1.0, 1.02], 24), ([-1.0, 1.0], 23)] {
+            let mut pieces = seen.clone();
+            pieces[8] = scaled(&seen[8], scale);
+            let assembly = jigsaw::assemble(&pieces, &Params::default()).expect("valid pieces");
+            let score = puzzle.score(&pieces, &assembly);
+            assert_eq!((assembly.placements.len(), score.wrong_matings), (placed, 0), "{seed} {scale:?}: {score:?}");
+        }
+    }
+}
