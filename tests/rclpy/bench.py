@@ -17,6 +17,7 @@ from sensor_msgs.msg import CompressedImage, Image
 from tf2_msgs.msg import TFMessage
 
 METRES_PER_PIXEL = 0.00025  # not the default, so that a forgotten scale shows
+SCALE = ("-p", f"capture_node:metres_per_pixel:={METRES_PER_PIXEL}")  # arguments of a cell
 
 POSITION_TOLERANCE_PX = 0.5  # of a piece's goal, after one rigid motion of the whole puzzle
 SIGHTING_TOLERANCE_PX = 1.0  # of a piece's centroid where it lies: the generator's blur and the kerf move it a little

@@ -9,10 +9,8 @@ from jigsaw_msgs.msg import Assembly
 from rclpy.action import ActionClient
 from unique_identifier_msgs.msg import UUID
 
-from bench import METRES_PER_PIXEL, Camera
+from bench import SCALE, Camera
 from conftest import LATCHED
-
-SCALE = ("-p", f"capture_node:metres_per_pixel:={METRES_PER_PIXEL}")
 
 
 class Client:
@@ -32,6 +30,10 @@ class Client:
         )
         return self.ros.result(sent, "answer to the goal")
 
+    def begin(self, **goal):
+        """Sends a goal until it is accepted: a node that has just come up is not active yet for a moment."""
+        return self.ros.until(lambda: (handle := self.send(**goal)).accepted and handle, "accepted goal")
+
     def end(self, handle):
         response = self.ros.result(handle.get_result_async(), "result", 60)
         return response.status, response.result
@@ -50,8 +52,7 @@ def client(ros):
 def test_a_goal_is_reached_with_feedback_on_the_way(launcher, ros, generate, client):
     launcher.cell(*SCALE)
     puzzle = generate(2, 3, 5)
-    handle = client.send(expected_pieces=6)
-    assert handle.accepted
+    handle = client.begin(expected_pieces=6)
     Camera(ros).show_puzzle(puzzle)
     status, result = client.end(handle)
     assert status == GoalStatus.STATUS_SUCCEEDED and result.complete
@@ -69,7 +70,7 @@ def test_a_goal_is_reached_with_feedback_on_the_way(launcher, ros, generate, cli
 
 def test_a_goal_ends_with_its_time(launcher, client):
     launcher.start("solver_node")
-    handle = client.send(expected_pieces=5, time_budget=Duration(sec=1))
+    handle = client.begin(expected_pieces=5, time_budget=Duration(sec=1))
     status, result = client.end(handle)
     assert status == GoalStatus.STATUS_ABORTED
     assert not result.complete and not result.assembly.pieces
@@ -77,7 +78,7 @@ def test_a_goal_ends_with_its_time(launcher, client):
 
 def test_a_goal_is_called_off(launcher, client):
     launcher.start("solver_node")
-    handle = client.send(expected_pieces=5)
+    handle = client.begin(expected_pieces=5)
     answer = client.cancel(handle)
     assert answer.return_code == CancelGoal.Response.ERROR_NONE
     assert [info.goal_id for info in answer.goals_canceling] == [handle.goal_id]
@@ -92,8 +93,10 @@ def test_one_goal_at_a_time(launcher, ros, client):
     other = Client(ros, "other_client")
     statuses = []
     client.node.create_subscription(GoalStatusArray, "/assemble/_action/status", statuses.append, LATCHED)
-    ros.until(client.client.server_is_ready, "action server")
     ros.until(other.client.server_is_ready, "action server")
+    first = client.begin(expected_pieces=2)
+    assert client.cancel(first).return_code == CancelGoal.Response.ERROR_NONE
+    assert client.end(first)[0] == GoalStatus.STATUS_CANCELED
     # Two at the same time: one of them is taken.
     both = [
         ros_client.client.send_goal_async(Assemble.Goal(expected_pieces=number))
@@ -116,7 +119,7 @@ def test_one_goal_at_a_time(launcher, ros, client):
     def states():
         return {tuple(one.goal_info.goal_id.uuid): one.status for array in statuses for one in array.status_list}
 
-    ros.until(lambda: list(states().values()) == [GoalStatus.STATUS_CANCELED] * 2, "status of both goals")
+    ros.until(lambda: list(states().values()) == [GoalStatus.STATUS_CANCELED] * 3, "status of all goals")
     other.client.destroy()
 
 

@@ -12,7 +12,7 @@ from visualization_msgs.msg import Marker, MarkerArray
 
 from bench import (
     AGAIN,
-    METRES_PER_PIXEL,
+    SCALE,
     Arm,
     Camera,
     Monitor,
@@ -21,8 +21,6 @@ from bench import (
     image_message,
 )
 from conftest import Harness
-
-SCALE = ("-p", f"capture_node:metres_per_pixel:={METRES_PER_PIXEL}")
 
 
 def test_from_camera_to_a_late_arm(launcher, ros, domain, generate):

@@ -14,8 +14,8 @@ from std_srvs.srv import Trigger
 from bench import (
     AGAIN,
     LATCHED_PIECES,
-    METRES_PER_PIXEL,
     RELIABLE,
+    SCALE,
     Arm,
     Camera,
     Monitor,
@@ -24,7 +24,6 @@ from bench import (
     image_message,
 )
 
-SCALE = ("-p", f"capture_node:metres_per_pixel:={METRES_PER_PIXEL}")
 SHIFT = 1  # pixels by which a piece is moved that counts as lying still: far less than 3 % of its area
 
 

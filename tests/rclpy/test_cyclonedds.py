@@ -4,7 +4,7 @@ import pytest
 from jigsaw_msgs.msg import Assembly
 from rosbags.typesys import get_types_from_msg
 
-from bench import METRES_PER_PIXEL, Camera, agree, by_child, check_assembly
+from bench import SCALE, Camera, agree, by_child, check_assembly
 from conftest import LATCHED
 from cyclone import Cyclone, idl_type
 
@@ -38,7 +38,7 @@ class CycloneArm:
 
 
 def test_assembly_and_transforms_of_a_late_joiner(launcher, ros, domain, generate, transcode):
-    launcher.cell("-p", f"capture_node:metres_per_pixel:={METRES_PER_PIXEL}")
+    launcher.cell(*SCALE)
     truth = Camera(ros).show_puzzle(generate(2, 3, 5))
     latest = []
     node = ros.node("watcher")

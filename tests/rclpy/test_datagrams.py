@@ -14,10 +14,9 @@ from pathlib import Path
 
 import pytest
 
-from bench import METRES_PER_PIXEL, Arm, Camera, check_assembly
+from bench import SCALE, Arm, Camera, check_assembly
 from conftest import Harness
 
-SCALE = ("-p", f"capture_node:metres_per_pixel:={METRES_PER_PIXEL}")
 MEMORY = 1024  # MiB of address space that a node may take
 RECOVERY = 60.0  # seconds until nodes that were started again know each other
 SEEDS = (1, 2)

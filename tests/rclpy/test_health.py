@@ -12,7 +12,7 @@ from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import Image
 from std_srvs.srv import Trigger
 
-from bench import BEST_EFFORT, METRES_PER_PIXEL, Arm, Camera, Monitor, image_message, stamped_frames
+from bench import BEST_EFFORT, METRES_PER_PIXEL, SCALE, Arm, Camera, Monitor, image_message, stamped_frames
 
 NODES = ("capture_node", "feature_node", "solver_node")
 FLOOD = 50  # refused frames, sent as fast as they go
@@ -20,7 +20,7 @@ THROTTLE = 5.0  # seconds between two lines of a kind
 
 
 def test_diagnostics_in_the_standard_form(launcher, ros, generate):
-    launcher.cell("-p", f"capture_node:metres_per_pixel:={METRES_PER_PIXEL}")
+    launcher.cell(*SCALE)
     monitor, arm = Monitor(ros), Arm(ros)
     Camera(ros).show_puzzle(generate(2, 3, 5))
     arm.complete(6)
@@ -82,7 +82,7 @@ def test_changes_of_parameters_are_told_and_refusals_counted(launcher, ros):
 
 
 def test_parameters_take_effect_while_the_cell_runs(launcher, ros, generate):
-    launcher.cell("-p", f"capture_node:metres_per_pixel:={METRES_PER_PIXEL}")
+    launcher.cell(*SCALE)
     arm = Arm(ros)
     Camera(ros).show_puzzle(generate(2, 3, 5))
     arm.complete(6)
@@ -104,7 +104,7 @@ def test_parameters_take_effect_while_the_cell_runs(launcher, ros, generate):
 
 
 def test_the_scale_can_be_changed_while_frames_come(launcher, ros, generate):
-    launcher.cell("-p", f"capture_node:metres_per_pixel:={METRES_PER_PIXEL}")
+    launcher.cell(*SCALE)
     camera = Camera(ros)
     first, second = list(stamped_frames(generate(2, 3, 5)))[:2]
     (before,) = camera.show(image_message(*first[1:]))
@@ -115,7 +115,7 @@ def test_the_scale_can_be_changed_while_frames_come(launcher, ros, generate):
 
 
 def test_pieces_beyond_the_most_are_refused_from_the_moment_it_is_set(launcher, ros, generate):
-    launcher.cell("-p", f"capture_node:metres_per_pixel:={METRES_PER_PIXEL}")
+    launcher.cell(*SCALE)
     monitor = Monitor(ros)
     most = {"type": ParameterType.PARAMETER_INTEGER, "integer_value": 4}
     assert set_parameter(ros, monitor.node, "solver_node", "maximum_pieces", **most).successful

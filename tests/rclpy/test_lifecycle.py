@@ -13,10 +13,9 @@ from rclpy.action import ActionClient
 from rclpy.lifecycle import LifecycleNode
 from std_srvs.srv import Trigger
 
-from bench import METRES_PER_PIXEL, Arm, Camera, check_assembly, image_message, stamped_frames
+from bench import SCALE, Arm, Camera, check_assembly, image_message, stamped_frames
 
 NODES = ("capture_node", "feature_node", "solver_node")
-SCALE = ("-p", f"capture_node:metres_per_pixel:={METRES_PER_PIXEL}")
 MANAGED = ("-p", "autostart:=false")
 
 # Up, down and up again, with transitions in between that are not allowed where they are asked for.

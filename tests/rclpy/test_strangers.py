@@ -19,6 +19,7 @@ from bench import (
     LATCHED_PIECES,
     METRES_PER_PIXEL,
     RELIABLE,
+    SCALE,
     Arm,
     Camera,
     Monitor,
@@ -26,7 +27,6 @@ from bench import (
     image_message,
 )
 
-SCALE = ("-p", f"capture_node:metres_per_pixel:={METRES_PER_PIXEL}")
 FLOOD_SECONDS = float(os.environ.get("JIGSAW_FLOOD_SECONDS", "5"))  # the long run takes 60
 FLOOD_RATE = 1000  # messages a second on each input
 FLOOD_GROWTH = 100e6  # bytes that a node may take beyond what it had before
