@@ -112,11 +112,11 @@ impl Fitting {
     /// Logarithm of the odds that a piece belongs where it is tried: how much likelier its cost is for a piece that is
     /// placed than for a stranger in a place as enclosed, and how rarely such a one doesn't overlap.
     fn evidence(&self, trial: &Trial) -> f64 {
-        let strangers = alike(&self.strangers, trial.misfit.share, ALIKE);
-        let rarity = (strangers.len() + 1) as f64 / (strangers.iter().filter(|s| s.1).count() + 1) as f64;
         if trial.misfit.cost > self.right.0 + UNLIKE * self.right.1 {
             return f64::NEG_INFINITY;
         }
+        let strangers = alike(&self.strangers, trial.misfit.share, ALIKE);
+        let rarity = (strangers.len() + 1) as f64 / (strangers.iter().filter(|s| s.1).count() + 1) as f64;
         let mut costs: Vec<f64> = alike(&self.costs, trial.misfit.share, COSTS).iter().map(|s| s.1).collect();
         costs.sort_by(f64::total_cmp);
         costs.truncate(costs.len().div_ceil(BEST));
@@ -205,8 +205,10 @@ impl Assembler<'_> {
             if trials.is_empty() {
                 return;
             }
-            let Some(fitting) = learnt.take().or_else(|| self.fitting()) else { return };
-            let fitting = &*learnt.insert(fitting);
+            if learnt.is_none() {
+                *learnt = self.fitting();
+            }
+            let Some(fitting) = learnt else { return };
             let sure = |t: &Trial| {
                 let evidence = fitting.evidence(t);
                 let rivals = trials.iter().filter(|o| (o.piece == t.piece) != self.same_place(o, t));
