@@ -28,8 +28,7 @@ pub(crate) fn lay_out(
     islands
         .iter()
         .map(|members| {
-            let points = members.iter().flat_map(|k| outlines[*k].hull.iter().map(move |p| poses[*k] * p));
-            let hull = convex_hull(points.collect());
+            let hull = hull(outlines, poses, members);
             let turn = upright(outlines, poses, members, &hull);
             let (low, high) = bounds(&hull, &turn);
             let motion = Isometry2::from_parts(Translation2::new(left - low.x, -low.y), turn);
@@ -37,6 +36,24 @@ pub(crate) fn lay_out(
             (members.clone(), motion)
         })
         .collect()
+}
+
+/// Convex hull of an island. Most pieces lie well within that of all centroids and can't touch it.
+fn hull(outlines: &[&Outline], poses: &[Isometry2<f64>], members: &[usize]) -> Vec<Point> {
+    let centre = |k: usize| poses[k] * outlines[k].centroid;
+    let inner = convex_hull(members.iter().map(|k| centre(*k)).collect());
+    let sides: Vec<(Point, Vector2<f64>)> = inner
+        .iter()
+        .zip(inner.iter().cycle().skip(1))
+        .filter_map(|(p, q)| Some((*p, (q - p).try_normalize(f64::EPSILON)?)))
+        .collect();
+    // The hull runs anticlockwise about what is to the left of each side.
+    let within = |k: usize| {
+        let (at, radius) = (centre(k), outlines[k].radius);
+        sides.len() > 2 && sides.iter().all(|(p, along)| along.perp(&(at - p)) >= radius)
+    };
+    let outer = members.iter().filter(|k| !within(**k));
+    convex_hull(outer.flat_map(|k| outlines[*k].hull.iter().map(move |p| poses[*k] * p)).collect())
 }
 
 /// Least and greatest coordinates of turned points.

@@ -18,6 +18,7 @@ pub mod params;
 pub mod placement;
 mod posegraph;
 mod search;
+mod slots;
 pub mod solver;
 
 pub use params::{Budget, Params, ParamsError, Policy};

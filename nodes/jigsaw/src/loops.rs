@@ -20,18 +20,18 @@
 use crate::outline::Outline;
 use crate::placement::laid_on;
 use crate::posegraph::{lever, turned};
+use crate::slots::{Slot, Slots};
 use isthmus::Point;
 use nalgebra::{Isometry2, Matrix3, Vector2, Vector3};
 
 /// A candidate mating as the assembly sees it: pieces are ranks by id.
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) struct Edge {
-    /// Piece with the tab, and position in its `tabs`.
+    /// Piece with the tab, and piece with the mouth.
     pub(crate) a: usize,
-    pub(crate) tab: usize,
-    /// Piece with the mouth, and position in its `mouths`.
     pub(crate) b: usize,
-    pub(crate) mouth: usize,
+    /// The tab, and the mouth.
+    pub(crate) slots: [Slot; 2],
     pub(crate) b_from_a: Isometry2<f64>,
     /// What the contact leaves open of that pose: covariance of (x, y, turn) of `a` about the point `at`, both in the
     /// image of `b`, for border residuals of variance one.
@@ -44,44 +44,6 @@ pub(crate) struct Edge {
     pub(crate) tab_rank: usize,
     /// Loops it takes part in.
     pub(crate) support: usize,
-}
-
-/// One isthmus of one piece.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
-pub(crate) struct Slot {
-    pub(crate) piece: usize,
-    pub(crate) tab: bool,
-    pub(crate) index: usize,
-}
-
-impl Edge {
-    pub(crate) fn slots(&self) -> [Slot; 2] {
-        [Slot { piece: self.a, tab: true, index: self.tab }, Slot { piece: self.b, tab: false, index: self.mouth }]
-    }
-}
-
-/// Whether two isthmuses of one piece claim the same stretch of border: more than half of the shorter one.
-pub(crate) fn conflict(outline: &Outline, p: Slot, q: Slot) -> bool {
-    if p.piece != q.piece {
-        return false;
-    }
-    if p == q {
-        return true;
-    }
-    let segment = |s: Slot| if s.tab { &outline.tabs[s.index] } else { &outline.mouths[s.index] };
-    let (p, q) = (segment(p), segment(q));
-    let length = outline.length;
-    // Overlap of two arcs of a circle: one begins inside the other.
-    let ahead = (q.arc - p.arc).rem_euclid(length);
-    let behind = (p.arc - q.arc).rem_euclid(length);
-    let shared = if ahead < p.path {
-        (p.path - ahead).min(q.path)
-    } else if behind < q.path {
-        (q.path - behind).min(p.path)
-    } else {
-        0.0
-    };
-    shared > 0.5 * p.path.min(q.path)
 }
 
 /// A closed loop: its candidates, the Mahalanobis distance by which it fails to close, and the evidence (natural
@@ -178,6 +140,7 @@ pub(crate) fn deviation(edge: &Edge, b_from_a: &Isometry2<f64>, point: Point) ->
 pub(crate) struct Ways<'a> {
     edges: &'a [Edge],
     outlines: &'a [&'a Outline],
+    slots: &'a Slots<'a>,
     tolerance: Tolerance,
     steps: Vec<Vec<Way>>,
 }
@@ -193,7 +156,11 @@ pub(crate) struct Decoys {
 
 impl<'a> Ways<'a> {
     /// The ways along the candidates `active` (positions in `edges`).
-    pub(crate) fn new(edges: &'a [Edge], active: &[usize], outlines: &'a [&'a Outline], tolerance: Tolerance) -> Self {
+    pub(crate) fn new(
+        (edges, active): (&'a [Edge], &[usize]),
+        (outlines, slots): (&'a [&'a Outline], &'a Slots<'a>),
+        tolerance: Tolerance,
+    ) -> Self {
         let mut steps: Vec<Vec<Way>> = vec![Vec::new(); outlines.len()];
         for &k in active {
             let e = &edges[k];
@@ -201,40 +168,38 @@ impl<'a> Ways<'a> {
             steps[e.b].push(way(e.a, e.b_from_a));
             steps[e.a].push(way(e.b, e.b_from_a.inverse()));
         }
-        Self { edges, outlines, tolerance, steps }
+        Self { edges, outlines, slots, tolerance, steps }
     }
 
-    /// All loops that close within the tolerance.
-    pub(crate) fn close(&self) -> Vec<Loop> {
-        use rayon::prelude::*;
-        let found: Vec<Vec<Loop>> = (0..self.outlines.len()).into_par_iter().map(|a| self.close_at(a)).collect();
-        found.into_iter().flatten().collect()
-    }
-
-    /// What would close if the piece on each way of two steps were another one. Of large puzzles only a part is tried.
-    pub(crate) fn close_decoys(&self) -> Decoys {
+    /// All loops that close within the tolerance, and what would close if the piece on each way of two steps were another
+    /// one. Of large puzzles only a part of the decoys is tried.
+    pub(crate) fn close(&self) -> (Vec<Loop>, Decoys) {
         use rayon::prelude::*;
         /// Sets of decoys at most: a few pieces have too few ways to show what chance does.
         const SETS: u64 = 3;
         /// Ways tried at most, about: more don't make chance better known.
         const TRIES: f64 = 25_000.0;
-        let slots: [Vec<Slot>; 2] = [false, true].map(|tab| {
-            let count = |o: &Outline| if tab { o.tabs.len() } else { o.mouths.len() };
-            let all = self.outlines.iter().enumerate();
-            all.flat_map(|(piece, o)| (0..count(o)).map(move |index| Slot { piece, tab, index })).collect()
-        });
+        let n = self.outlines.len();
+        let doors = [false, true].map(|tabs| (0..n).flat_map(|k| self.slots.of(k, tabs)).collect::<Vec<Slot>>());
         // Of the ways from each piece about half lead to pieces of higher rank.
         let ways: usize = self.steps.iter().map(|s| s.len() * s.len()).sum::<usize>() / 2;
         let share = (TRIES / (SETS * ways.max(1) as u64) as f64).min(1.0);
-        let taken = |a: &usize| (share * (a + 1) as f64).floor() > (share * *a as f64).floor();
-        let starts: Vec<usize> = (0..self.outlines.len()).filter(taken).collect();
-        let found: Vec<Decoys> = starts.par_iter().map(|a| self.decoys_at(*a, &slots, SETS)).collect();
-        let sets = (starts.len() as u64 * SETS) as f64 / self.outlines.len().max(1) as f64;
-        found.into_iter().fold(Decoys { sets, ..Decoys::default() }, |mut all, some| {
-            all.distances.extend(some.distances);
-            all.akin += some.akin;
-            all
-        })
+        let tried = |a: usize| (share * (a + 1) as f64).floor() > (share * a as f64).floor();
+        let from = |a: usize| {
+            let ways = self.from(a);
+            (self.close_at(a, &ways), tried(a).then(|| self.decoys_at(a, &ways, &doors, SETS)))
+        };
+        let found: Vec<(Vec<Loop>, Option<Decoys>)> = (0..n).into_par_iter().map(from).collect();
+        let sets = SETS as f64 * (0..n).filter(|a| tried(*a)).count() as f64 / n.max(1) as f64;
+        let mut all = (Vec::new(), Decoys { sets, ..Decoys::default() });
+        for (loops, decoys) in found {
+            all.0.extend(loops);
+            if let Some(some) = decoys {
+                all.1.distances.extend(some.distances);
+                all.1.akin += some.akin;
+            }
+        }
+        all
     }
 
     /// Ways of one and two steps from `a` to pieces of higher rank, ordered by the piece and by where they lead: compared
@@ -245,7 +210,7 @@ impl<'a> Ways<'a> {
             long.push(*first);
             let arrives = self.arrives(first);
             for second in self.steps[first.to].iter().filter(|w| w.to > a && w.to != first.to) {
-                if conflict(self.outlines[first.to], arrives, self.leaves(first.to, second)) {
+                if self.slots.conflict(arrives, self.leaves(first.to, second)) {
                     continue;
                 }
                 long.push(Way {
@@ -269,12 +234,12 @@ impl<'a> Ways<'a> {
 
     /// The isthmus by which a way leaves the piece from which it starts, and the one by which it arrives.
     fn leaves(&self, from: usize, way: &Way) -> Slot {
-        let [tab, mouth] = self.edges[way.edges[0]].slots();
+        let [tab, mouth] = self.edges[way.edges[0]].slots;
         if tab.piece == from { tab } else { mouth }
     }
 
     fn arrives(&self, way: &Way) -> Slot {
-        let [tab, mouth] = self.edges[way.edges[1]].slots();
+        let [tab, mouth] = self.edges[way.edges[1]].slots;
         if tab.piece == way.to { tab } else { mouth }
     }
 
@@ -283,10 +248,10 @@ impl<'a> Ways<'a> {
         self.tolerance.position * self.outlines[to].scale
     }
 
-    /// The loops in which `a` has the least rank.
-    fn close_at(&self, a: usize) -> Vec<Loop> {
+    /// The loops in which `a` has the least rank, given the ways from it.
+    fn close_at(&self, a: usize, ways: &[(Place, Way)]) -> Vec<Loop> {
         let mut found = Vec::new();
-        for group in self.from(a).chunk_by(|p, q| p.0.to == q.0.to) {
+        for group in ways.chunk_by(|p, q| p.0.to == q.0.to) {
             let reach = self.reach(group[0].0.to);
             for (i, (place, p)) in group.iter().enumerate() {
                 let near = group[i + 1..].iter().take_while(|(other, _)| other.x - place.x <= reach);
@@ -297,12 +262,12 @@ impl<'a> Ways<'a> {
     }
 
     /// The decoys of some sets among the loops in which `a` has the least rank.
-    fn decoys_at(&self, a: usize, slots: &[Vec<Slot>; 2], sets: u64) -> Decoys {
+    fn decoys_at(&self, a: usize, ways: &[(Place, Way)], doors: &[Vec<Slot>; 2], sets: u64) -> Decoys {
         let mut found = Decoys::default();
-        for group in self.from(a).chunk_by(|p, q| p.0.to == q.0.to).filter(|g| g.len() > 1) {
+        for group in ways.chunk_by(|p, q| p.0.to == q.0.to).filter(|g| g.len() > 1) {
             let reach = self.reach(group[0].0.to);
             for (set, (_, p)) in (0..sets).flat_map(|set| group.iter().map(move |p| (set, p))) {
-                let Some(decoy) = self.exchanged(a, p, slots, set) else { continue };
+                let Some(decoy) = self.exchanged(a, p, doors, set) else { continue };
                 let x = self.place(&decoy).x;
                 let from = group.partition_point(|(place, _)| place.x < x - reach);
                 let near = group[from..].iter().take_while(|(place, _)| place.x <= x + reach);
@@ -319,41 +284,34 @@ impl<'a> Ways<'a> {
 
     /// A way of two steps with the piece between them exchanged for some other one, which is entered and left by
     /// isthmuses of the same polarity; `None` for a single step.
-    fn exchanged(&self, a: usize, way: &Way, slots: &[Vec<Slot>; 2], set: u64) -> Option<Way> {
+    fn exchanged(&self, a: usize, way: &Way, doors: &[Vec<Slot>; 2], set: u64) -> Option<Way> {
         let via = way.via?;
         let [first, second] = way.edges.map(|k| &self.edges[k]);
-        let of = |e: &Edge| e.slots().into_iter().find(|s| s.piece == via);
+        let of = |e: &Edge| e.slots.into_iter().find(|s| s.piece == via);
         let (enters, leaves) = (of(first)?, of(second)?);
         // Multiplication by a large odd number scatters what is looked up (Knuth 1973, Fibonacci hashing).
         let seed = [a, way.edges[0], way.edges[1]]
             .iter()
             .fold(set + 1, |s, k| (s ^ *k as u64).wrapping_mul(0x9E37_79B9_7F4A_7C15).rotate_left(29));
-        let doors = &slots[usize::from(enters.tab)];
+        let doors = &doors[usize::from(self.slots.is_tab(enters))];
         let door = doors[(seed >> 8) as usize % doors.len()];
-        let others: Vec<&Slot> = {
-            let all = &slots[usize::from(leaves.tab)];
-            let from = all.partition_point(|s| s.piece < door.piece);
-            all[from..].iter().take_while(|s| s.piece == door.piece).filter(|s| **s != door).collect()
-        };
-        if door.piece == via || others.is_empty() {
+        let others = || self.slots.of(door.piece, self.slots.is_tab(leaves)).filter(|s| *s != door);
+        let count = others().count();
+        if door.piece == via || count == 0 {
             return None;
         }
-        let other = *others[(seed >> 40) as usize % others.len()];
+        let other = others().nth((seed >> 40) as usize % count)?;
         // The stranger lies as its first isthmus says; its second one leads elsewhere than that of the piece it replaces.
-        let by_first = self.laid(enters, door)?;
-        let by_second = self.laid(leaves, other)?;
+        let by_first = self.laid(enters, door);
+        let by_second = self.laid(leaves, other);
         let (to_via, _) = step(first, a, &Isometry2::identity(), Point::origin());
         let from_via = to_via.inverse() * way.pose;
         Some(Way { pose: to_via * by_first * by_second.inverse() * from_via, ..*way })
     }
 
     /// Pose of the piece of `other` in which its segment lies on that of `slot` best.
-    fn laid(&self, slot: Slot, other: Slot) -> Option<Isometry2<f64>> {
-        let segment = |s: Slot| {
-            let o = self.outlines[s.piece];
-            if s.tab { o.tabs.get(s.index) } else { o.mouths.get(s.index) }
-        };
-        Some(laid_on(segment(other)?, segment(slot)?))
+    fn laid(&self, slot: Slot, other: Slot) -> Isometry2<f64> {
+        laid_on(self.slots.segment(other), self.slots.segment(slot))
     }
 
     /// The loop that two ways from `a` to one piece make, if they do.
@@ -371,8 +329,8 @@ impl<'a> Ways<'a> {
         if d > self.tolerance.position || turn > self.tolerance.angle {
             return None;
         }
-        if conflict(self.outlines[a], self.leaves(a, p), self.leaves(a, q))
-            || conflict(outline, self.arrives(p), self.arrives(q))
+        if self.slots.conflict(self.leaves(a, p), self.leaves(a, q))
+            || self.slots.conflict(self.arrives(p), self.arrives(q))
         {
             return None;
         }

@@ -2,12 +2,10 @@
 //!
 //! Each contact of two pieces says how one should move relative to the other, as a quadratic form in the small motion
 //! (x, y, turn) at the contact (Lu and Milios 1997, *Globally consistent range scan alignment*). The sum over all
-//! contacts is minimised by one sparse Cholesky factorisation in 3 x 3 blocks, nodes eliminated by least degree (fill
-//! O(n log n) on the planar graph of a puzzle). The first node of each connected part stays where it is.
+//! contacts is minimised by one sparse Cholesky factorisation in 3 x 3 blocks, nodes eliminated by nested dissection along
+//! the axes (George 1973; fill O(n log n) on the planar graph of a puzzle). The first node of each connected part stays where it is.
 
 use nalgebra::{Matrix3, Point2, UnitComplex, Vector3};
-use std::cmp::Reverse;
-use std::collections::BinaryHeap;
 
 /// A contact: the motion `d` of node `a` relative to node `b` at `centre` costs `½ dᵀ hessian d + gradientᵀ d`.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -32,7 +30,7 @@ pub(crate) fn turned(rotation: UnitComplex<f64>) -> Matrix3<f64> {
 
 /// Motions (x, y, turn about the reference point) of all nodes that minimise the sum of the factors.
 pub(crate) fn minimise(references: &[Point2<f64>], factors: &[Factor]) -> Vec<Vector3<f64>> {
-    Plan::new(references.len(), factors).minimise(references, factors)
+    Plan::new(references, factors).minimise(references, factors)
 }
 
 /// In which order nodes are eliminated, and between which of them blocks then stand: a matter of which nodes factors
@@ -48,42 +46,37 @@ pub(crate) struct Plan {
 }
 
 impl Plan {
-    pub(crate) fn new(n: usize, factors: &[Factor]) -> Self {
+    /// Nodes lie at the reference points.
+    pub(crate) fn new(references: &[Point2<f64>], factors: &[Factor]) -> Self {
+        let n = references.len();
         let mut around: Vec<Vec<usize>> = vec![Vec::new(); n];
         for f in factors.iter().filter(|f| f.a != f.b) {
             around[f.a].push(f.b);
             around[f.b].push(f.a);
         }
-        for near in &mut around {
-            near.sort_unstable();
-            near.dedup();
+        let mut order = Vec::with_capacity(n);
+        dissect(&mut (0..n).collect::<Vec<usize>>(), references, &around, &mut vec![false; n], &mut order);
+        let mut place = vec![0; n];
+        for (k, node) in order.iter().enumerate() {
+            place[*node] = k;
         }
-        // Degrees that have changed since are skipped when their turn comes.
-        let mut queue: BinaryHeap<Reverse<(usize, usize)>> =
-            around.iter().enumerate().map(|(k, near)| Reverse((near.len(), k))).collect();
-        let (mut order, mut place) = (Vec::with_capacity(n), vec![usize::MAX; n]);
-        let mut later: Vec<Vec<usize>> = Vec::with_capacity(n);
-        let mut merged = Vec::new();
-        while let Some(Reverse((degree, k))) = queue.pop() {
-            if place[k] != usize::MAX || degree != around[k].len() {
-                continue;
-            }
-            place[k] = order.len();
-            order.push(k);
-            let near = std::mem::take(&mut around[k]);
-            for &i in &near {
-                merge(&around[i], &near, &mut merged);
-                merged.retain(|j| *j != i && *j != k);
-                std::mem::swap(&mut around[i], &mut merged);
-                queue.push(Reverse((around[i].len(), i)));
-            }
-            later.push(near);
-        }
+        // The row of a node has its own later neighbours, and what is left of the rows of those eliminated into it.
+        let mut into: Vec<Vec<usize>> = vec![Vec::new(); n];
         let (mut starts, mut columns) = (vec![0], Vec::new());
-        for mut row in later {
-            row.iter_mut().for_each(|j| *j = place[*j]);
+        let mut row = Vec::new();
+        for (k, node) in order.iter().enumerate() {
+            row.clear();
+            row.extend(around[*node].iter().map(|other| place[*other]));
+            for child in std::mem::take(&mut into[k]) {
+                row.extend_from_slice(&columns[starts[child]..starts[child + 1]]);
+            }
+            row.retain(|later| *later > k);
             row.sort_unstable();
-            columns.extend(row);
+            row.dedup();
+            if let Some(next) = row.first() {
+                into[*next].push(k);
+            }
+            columns.extend_from_slice(&row);
             starts.push(columns.len());
         }
         Self { order, place, starts, columns }
@@ -174,20 +167,36 @@ fn roots(n: usize, factors: &[Factor]) -> Vec<usize> {
     (0..n).filter(|k| parts[*k] == *k).collect()
 }
 
-/// The union of two lists in order.
-fn merge(p: &[usize], q: &[usize], union: &mut Vec<usize>) {
-    union.clear();
-    let (mut p, mut q) = (p.iter().peekable(), q.iter().peekable());
-    loop {
-        let least = match (p.peek(), q.peek()) {
-            (Some(a), Some(b)) => **a.min(b),
-            (Some(k), None) | (None, Some(k)) => **k,
-            (None, None) => return,
-        };
-        union.push(least);
-        p.next_if(|k| **k == least);
-        q.next_if(|k| **k == least);
+/// Appends some nodes to an order of elimination: one half of them, then the other, then those that part the two.
+/// `beyond` is false for all nodes, before and after.
+fn dissect(
+    nodes: &mut [usize],
+    at: &[Point2<f64>],
+    around: &[Vec<usize>],
+    beyond: &mut [bool],
+    order: &mut Vec<usize>,
+) {
+    /// So few are not worth parting.
+    const FEW: usize = 4;
+    if nodes.len() <= FEW {
+        order.extend_from_slice(nodes);
+        return;
     }
+    let extent = |axis: usize| {
+        let along = || nodes.iter().map(|k| at[*k][axis]);
+        along().fold(f64::NEG_INFINITY, f64::max) - along().fold(f64::INFINITY, f64::min)
+    };
+    let axis = usize::from(extent(1) > extent(0));
+    let middle = nodes.len() / 2;
+    nodes.select_nth_unstable_by(middle, |p, q| at[*p][axis].total_cmp(&at[*q][axis]).then(p.cmp(q)));
+    let (near, far) = nodes.split_at_mut(middle);
+    far.iter().for_each(|k| beyond[*k] = true);
+    let (mut parting, mut near): (Vec<usize>, Vec<usize>) =
+        near.iter().partition(|k| around[**k].iter().any(|other| beyond[*other]));
+    far.iter().for_each(|k| beyond[*k] = false);
+    dissect(&mut near, at, around, beyond, order);
+    dissect(far, at, around, beyond, order);
+    order.append(&mut parting);
 }
 
 #[cfg(test)]

@@ -16,14 +16,15 @@ mod state;
 
 use crate::contact::{ClearancePrior, Contact, Memory};
 use crate::copies::copies;
-use crate::loops::{self, Closure, Edge, Said, Slot, Tolerance, conflict, difference};
+use crate::loops::{self, Closure, Edge, Said, Tolerance, difference};
 use crate::outline::Outline;
 use crate::params::Budget;
 use crate::placement::Joint;
 use crate::posegraph::{Factor, Plan, turned};
+use crate::slots::{Slot, Slots};
 use crate::{Params, Policy, placement};
 use nalgebra::{Isometry2, Matrix3, Point2, Translation2, UnitComplex, Vector2, Vector3};
-use state::{Slots, State};
+use state::State;
 use std::cmp::Reverse;
 use std::collections::{BTreeMap, HashMap};
 
@@ -146,7 +147,7 @@ struct Assembler<'a> {
     closure: Closure,
     /// Pieces that wait: copies of others, until those are placed.
     aside: Vec<bool>,
-    slots: Slots,
+    slots: Slots<'a>,
     state: State,
     /// How the last island that was adjusted is eliminated: the next one is often the same.
     plan: Option<Plan>,
@@ -168,13 +169,13 @@ pub(crate) fn assemble(
     }
     let mut scales: Vec<f64> = outlines.iter().map(|o| o.scale).collect();
     let scale = *scales.select_nth_unstable_by(n / 2, f64::total_cmp).1;
+    let slots = Slots::new(outlines);
     let mut edges: Vec<Edge> = joints
         .iter()
         .map(|j| Edge {
             a: j.a,
-            tab: j.tab,
             b: j.b,
-            mouth: j.mouth,
+            slots: [slots.tab(j.a, j.tab), slots.mouth(j.b, j.mouth)],
             b_from_a: j.fit.negative_from_positive,
             covariance: covariance(&j.fit.information, outlines[j.b].scale),
             at: outlines[j.b].mouths[j.mouth].origin,
@@ -184,7 +185,6 @@ pub(crate) fn assemble(
             support: 0,
         })
         .collect();
-    let slots = Slots::new(outlines);
     rank(&mut edges, &slots);
     let mut at = vec![Vec::new(); n];
     for (k, e) in edges.iter().enumerate() {
@@ -207,7 +207,7 @@ pub(crate) fn assemble(
         },
         closure: Closure::guess(0.02, 1.0),
         aside: vec![false; n],
-        state: State::new(&slots),
+        state: State::new(n, &slots),
         slots,
         plan: None,
         backtracks: 0,
@@ -231,7 +231,7 @@ fn rank(edges: &mut [Edge], slots: &Slots) {
     order.sort_unstable_by(|p, q| edges[*p].cost.total_cmp(&edges[*q].cost).then(p.cmp(q)));
     let mut counts = vec![0; slots.count()];
     for k in order {
-        let [tab, mouth] = edges[k].slots().map(|s| slots.number(s));
+        let [tab, mouth] = edges[k].slots.map(|s| s.number);
         (edges[k].tab_rank, edges[k].mouth_rank) = (counts[tab], counts[mouth]);
         counts[tab] += 1;
         counts[mouth] += 1;
@@ -319,7 +319,7 @@ impl Assembler<'_> {
         let mut queue = std::collections::VecDeque::from([Vec::new()]);
         let mut best: Option<((usize, Reverse<usize>), State)> = None;
         while let Some(skipped) = queue.pop_front() {
-            self.state = State::new(&self.slots);
+            self.state = State::new(n, &self.slots);
             let mut decisions = Vec::new();
             for &k in &ranked {
                 if !skipped.contains(&k) && !self.same_island(k) && self.join(k) {
@@ -381,10 +381,8 @@ impl Assembler<'_> {
     /// among more. The best come first; what is more likely chance is left out.
     fn close_loops(&mut self, joints: &[Joint]) -> Vec<loops::Loop> {
         self.closure = self.first_guess();
-        let ways = self.ways(FIRST_RANKS);
-        let decoys = ways.close_decoys();
+        let (mut first, decoys) = self.ways(FIRST_RANKS).close();
         if self.params.recalibrate {
-            let mut first = ways.close();
             self.closure = self.weigh(&decoys, &mut first);
             let sure = first.iter().filter(|l| l.evidence >= FOUND);
             let mut supported: Vec<usize> = sure.flat_map(|l| l.edges.iter().copied()).collect();
@@ -395,13 +393,13 @@ impl Assembler<'_> {
             self.learn(&supported);
         }
         // The fewer candidates take part, the fewer loops close by chance: those of the best ones say more.
-        let all = self.ways(LOOP_RANKS);
+        let (all, more_decoys) = self.ways(LOOP_RANKS).close();
         let among = |l: &loops::Loop| l.edges.iter().all(|k| self.among(*k, FIRST_RANKS));
-        let (mut best, others): (Vec<loops::Loop>, Vec<loops::Loop>) = all.close().into_iter().partition(among);
+        let (mut best, others): (Vec<loops::Loop>, Vec<loops::Loop>) = all.into_iter().partition(among);
         self.weigh(&decoys, &mut best);
         let mut found = best;
         found.extend(others);
-        self.closure = self.weigh(&all.close_decoys(), &mut found);
+        self.closure = self.weigh(&more_decoys, &mut found);
         self.sorted(found)
     }
 
@@ -413,7 +411,7 @@ impl Assembler<'_> {
     /// The ways along the best candidates.
     fn ways(&self, ranks: usize) -> loops::Ways<'_> {
         let active: Vec<usize> = (0..self.edges.len()).filter(|k| self.among(*k, ranks)).collect();
-        loops::Ways::new(&self.edges, &active, self.outlines, LOOSE)
+        loops::Ways::new((&self.edges, &active), (self.outlines, &self.slots), LOOSE)
     }
 
     /// How loops close, beside those of decoys; gives each loop the evidence that follows, unless it has more already.
@@ -476,10 +474,10 @@ impl Assembler<'_> {
         let mut right: Vec<f64> = trusted.iter().map(|k| self.edges[*k].cost).collect();
         let mut wrong = Vec::new();
         for &k in trusted {
-            let mouth = self.edges[k].slots()[1];
+            let mouth = self.edges[k].slots[1];
             let others = self.at[mouth.piece].iter().map(|j| (*j, &self.edges[*j]));
             let best =
-                others.filter(|(j, e)| *j != k && e.slots()[1] == mouth).map(|(_, e)| e.cost).min_by(f64::total_cmp);
+                others.filter(|(j, e)| *j != k && e.slots[1] == mouth).map(|(_, e)| e.cost).min_by(f64::total_cmp);
             wrong.extend(best);
         }
         if right.len() < FEW || wrong.len() < FEW {
@@ -506,10 +504,10 @@ impl Assembler<'_> {
                 let e = &self.edges[k];
                 let clear = |slot: Slot| {
                     self.at[slot.piece].iter().all(|j| {
-                        *j == k || !self.edges[*j].slots().contains(&slot) || self.edges[*j].cost > e.cost + WIDE
+                        *j == k || !self.edges[*j].slots.contains(&slot) || self.edges[*j].cost > e.cost + WIDE
                     })
                 };
-                e.mouth_rank == 0 && e.tab_rank == 0 && e.slots().into_iter().all(clear)
+                e.mouth_rank == 0 && e.tab_rank == 0 && e.slots.into_iter().all(clear)
             })
             .collect()
     }
@@ -545,19 +543,18 @@ impl Assembler<'_> {
 
     /// Whether no other mating has taken either stretch of border, and its pieces don't wait.
     fn free(&self, k: usize) -> bool {
-        !self.waits(k) && self.edges[k].slots().iter().all(|s| self.open(*s, k))
+        !self.waits(k) && self.edges[k].slots.iter().all(|s| self.open(*s, k))
     }
 
     /// Whether no mating but `k` has taken an isthmus or one that claims the same stretch of border.
     fn open(&self, slot: Slot, k: usize) -> bool {
-        let outline = self.outlines[slot.piece];
-        let taken = |other: &Slot| self.state.mating_at(self.slots.number(*other)).is_some_and(|j| j != k);
-        !self.slots.of(slot.piece).any(|other| taken(&other) && conflict(outline, slot, other))
+        let taken = |other: &Slot| self.state.mating_at(*other).is_some_and(|j| j != k);
+        !self.slots.rivals(slot).iter().any(taken)
     }
 
     /// Whether a candidate is a mating.
     fn holds(&self, k: usize) -> bool {
-        self.state.mating_at(self.slots.number(self.edges[k].slots()[0])) == Some(k)
+        self.state.mating_at(self.edges[k].slots[0]) == Some(k)
     }
 
     fn admissible(&self, k: usize) -> bool {
@@ -613,7 +610,7 @@ impl Assembler<'_> {
         let (mut here, mut there) = (Vec::new(), Vec::new());
         for &k in members {
             let e = &self.edges[k];
-            let centre = self.outlines[e.a].tabs[e.tab].origin;
+            let centre = self.slots.segment(e.slots[0]).origin;
             for (dx, dy) in [(0.3, 0.0), (-0.3, 0.0), (0.0, 0.3), (0.0, -0.3)] {
                 let p = centre + Vector2::new(dx, dy) * self.scale;
                 let (in_a, in_b) = (self.state.pose[e.a] * p, self.state.pose[e.b] * (e.b_from_a * p));
@@ -631,8 +628,7 @@ impl Assembler<'_> {
     }
 
     fn take(&mut self, k: usize) {
-        let slots = self.edges[k].slots().map(|s| self.slots.number(s));
-        self.state.take(k, slots);
+        self.state.take(k, self.edges[k].slots);
     }
 
     /// Moves the smaller of two islands into the frame of the other, unless they overlap.
@@ -734,7 +730,7 @@ impl Assembler<'_> {
             })
             .collect();
         let plan = self.plan.take().filter(|plan| plan.suits(members.len(), &factors));
-        let plan = plan.unwrap_or_else(|| Plan::new(members.len(), &factors));
+        let plan = plan.unwrap_or_else(|| Plan::new(&references, &factors));
         let motion = plan.minimise(&references, &factors);
         self.plan = Some(plan);
         for (i, &k) in members.iter().enumerate() {
@@ -852,10 +848,10 @@ impl Assembler<'_> {
             let e = &self.edges[*other];
             let piece = if self.state.island(e.a) == moving { e.a } else { e.b };
             let distance = loops::disagreement(&said[i], &said[j], self.centre_of(piece));
-            let slots = e.slots();
+            let slots = e.slots;
             let clashes = |g: &usize| {
-                let taken = self.edges[*g].slots();
-                taken.iter().any(|s| slots.iter().any(|t| conflict(self.outlines[s.piece], *s, *t)))
+                let taken = self.edges[*g].slots;
+                taken.iter().any(|s| slots.iter().any(|t| self.slots.conflict(*s, *t)))
             };
             if self.closure.admits(distance) && !group.members.iter().any(clashes) {
                 group.members.push(*other);
@@ -873,11 +869,11 @@ impl Assembler<'_> {
         for &k in &group.members {
             let e = &self.edges[k];
             let largest = size(e.a).max(size(e.b));
-            for slot in e.slots() {
+            for slot in e.slots {
                 for &j in &self.at[slot.piece] {
                     let other = &self.edges[j];
                     if group.members.contains(&j)
-                        || !other.slots().iter().any(|s| conflict(self.outlines[slot.piece], *s, slot))
+                        || !other.slots.iter().any(|s| self.slots.conflict(*s, slot))
                         || !self.free(j)
                     {
                         continue;
@@ -1053,9 +1049,8 @@ impl Assembler<'_> {
             let saved = self.state.clone();
             let before = self.worth();
             let mut occupants = Vec::new();
-            for slot in self.edges[k].slots() {
-                let near = self.slots.of(slot.piece).filter(|s| conflict(self.outlines[slot.piece], *s, slot));
-                for j in near.filter_map(|s| self.state.mating_at(self.slots.number(s))) {
+            for slot in self.edges[k].slots {
+                for j in self.slots.rivals(slot).iter().filter_map(|s| self.state.mating_at(*s)) {
                     let e = &self.edges[j];
                     occupants.push(if e.a == slot.piece { e.b } else { e.a });
                 }
@@ -1093,7 +1088,7 @@ impl Assembler<'_> {
         let mut evidence = vec![0.0f64; n];
         let mut chosen = Vec::new();
         for k in order {
-            let slots = self.edges[k].slots();
+            let slots = self.edges[k].slots;
             let own = self.model.evidence(self.edges[k].cost);
             let loops = self.edges[k].support.min(2) as f64 * AGREEMENT;
             if slots.iter().any(|s| taken.contains_key(s)) || (!paper && own + loops < IMPLAUSIBLE) {
@@ -1110,7 +1105,7 @@ impl Assembler<'_> {
         }
         let sure = |evidence: f64| 1.0 / (1.0 + (-evidence).exp());
         for k in chosen {
-            let [tab, mouth] = self.edges[k].slots();
+            let [tab, mouth] = self.edges[k].slots;
             // The first contact of a piece confirms nothing beside itself.
             let least = (evidence[tab.piece].min(evidence[mouth.piece]) - AGREEMENT).max(0.0);
             // All of the border where they lie says more than the segment by which they were matched.

@@ -297,9 +297,10 @@ impl Solver {
     /// The best assembly of the pieces that are there that a budget allows. What is not done for want of it is done by
     /// the next solution.
     pub fn solve_within(&mut self, budget: &dyn Budget) -> Assembly {
+        // All of it on one of the threads: handing each small step over to them would take longer than most steps.
         match self.pool.clone() {
             Some(pool) => pool.install(|| self.solve_here(budget)),
-            None => self.solve_here(budget),
+            None => rayon::scope(|_| self.solve_here(budget)),
         }
     }
 

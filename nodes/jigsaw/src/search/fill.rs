@@ -388,10 +388,10 @@ impl Assembler<'_> {
         let right = (middle, deviation.max(upper));
         // Every other candidate of an isthmus that has a mating leads a stranger to the place of the piece there.
         let instead = |k: &usize| {
-            let ends = self.edges[*k].slots();
+            let ends = self.edges[*k].slots;
             [(ends[0], ends[1].piece), (ends[1], ends[0].piece)].into_iter().flat_map(move |(held, piece)| {
                 let others = self.at[held.piece].iter().filter_map(move |j| {
-                    let [tab, mouth] = self.edges[*j].slots();
+                    let [tab, mouth] = self.edges[*j].slots;
                     let stranger = if tab == held { mouth.piece } else { tab.piece };
                     ((tab == held || mouth == held) && stranger != piece).then_some((*j, stranger, held.piece, piece))
                 });

@@ -3,8 +3,8 @@
 //! Islands are disjoint sets whose members form a ring, so that two are united by exchanging two links, whatever their
 //! sizes, and a whole state is a few flat vectors: to save one before a step that may be undone is one copy of each.
 
-use crate::loops::{Edge, Slot};
-use crate::outline::Outline;
+use crate::loops::Edge;
+use crate::slots::{Slot, Slots};
 use nalgebra::Isometry2;
 use std::collections::BTreeMap;
 
@@ -23,15 +23,15 @@ pub(super) struct State {
     pub(super) adjusted: Vec<usize>,
     /// Candidates that are matings, in the order in which they were taken.
     joined: Vec<usize>,
-    /// The mating at each isthmus, by [`Slots::number`].
+    /// The mating at each isthmus, by its number.
     used: Vec<Option<usize>>,
     /// Evidence for pieces that were placed because their whole border fits.
     pub(super) fitted: BTreeMap<usize, f64>,
 }
 
 impl State {
-    pub(super) fn new(slots: &Slots) -> Self {
-        let n = slots.first.len();
+    /// So many pieces, each by itself, with their isthmuses.
+    pub(super) fn new(n: usize, slots: &Slots) -> Self {
         Self {
             island: (0..n).collect(),
             next: (0..n).collect(),
@@ -39,7 +39,7 @@ impl State {
             pose: vec![Isometry2::identity(); n],
             adjusted: vec![1; n],
             joined: Vec::new(),
-            used: vec![None; slots.count],
+            used: vec![None; slots.count()],
             fitted: BTreeMap::new(),
         }
     }
@@ -94,17 +94,17 @@ impl State {
         &self.joined
     }
 
-    /// The mating at an isthmus, by its number.
-    pub(super) fn mating_at(&self, slot: usize) -> Option<usize> {
-        self.used[slot]
+    /// The mating at an isthmus.
+    pub(super) fn mating_at(&self, slot: Slot) -> Option<usize> {
+        self.used[slot.number]
     }
 
     /// Takes a candidate as a mating of two isthmuses.
-    pub(super) fn take(&mut self, candidate: usize, slots: [usize; 2]) {
-        if slots.iter().any(|s| self.used[*s] != Some(candidate)) {
+    pub(super) fn take(&mut self, candidate: usize, slots: [Slot; 2]) {
+        if slots.iter().any(|s| self.used[s.number] != Some(candidate)) {
             self.joined.push(candidate);
         }
-        slots.into_iter().for_each(|s| self.used[s] = Some(candidate));
+        slots.into_iter().for_each(|s| self.used[s.number] = Some(candidate));
     }
 
     /// Keeps some of the matings only; what no longer hangs together becomes islands apart.
@@ -125,44 +125,5 @@ impl State {
             self.joined.push(k);
         }
         self.adjusted.copy_from_slice(&self.size);
-    }
-}
-
-/// Numbers of all isthmuses, those of a piece one after the other, tabs first.
-#[derive(Debug, Clone)]
-pub(super) struct Slots {
-    first: Vec<usize>,
-    tabs: Vec<usize>,
-    count: usize,
-}
-
-impl Slots {
-    pub(super) fn new(outlines: &[&Outline]) -> Self {
-        let mut count = 0;
-        let mut number = |o: &&Outline| {
-            let first = count;
-            count += o.tabs.len() + o.mouths.len();
-            first
-        };
-        let first = outlines.iter().map(&mut number).collect();
-        Self { first, tabs: outlines.iter().map(|o| o.tabs.len()).collect(), count }
-    }
-
-    pub(super) fn count(&self) -> usize {
-        self.count
-    }
-
-    pub(super) fn number(&self, slot: Slot) -> usize {
-        self.first[slot.piece] + slot.index + if slot.tab { 0 } else { self.tabs[slot.piece] }
-    }
-
-    /// All isthmuses of a piece.
-    pub(super) fn of(&self, piece: usize) -> impl Iterator<Item = Slot> {
-        let tabs = self.tabs[piece];
-        let end = self.first.get(piece + 1).copied().unwrap_or(self.count);
-        (0..end - self.first[piece]).map(move |k| {
-            let tab = k < tabs;
-            Slot { piece, tab, index: if tab { k } else { k - tabs } }
-        })
     }
 }
