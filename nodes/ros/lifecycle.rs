@@ -160,9 +160,27 @@ struct Manager {
     check: Check,
     forget: mpsc::Sender<Forget>,
     events: mpsc::Sender<TransitionEvent>,
+    /// Steps made of which nobody has been told.
+    untold: Vec<TransitionEvent>,
 }
 
+/// The way up of a node that starts by itself.
+const START: [u8; 2] = [Transition::TRANSITION_CONFIGURE, Transition::TRANSITION_ACTIVATE];
+
 impl Manager {
+    /// Goes all the way up, at once: nothing that comes from outside finds the node half way. Those who listen are told
+    /// later, by [`Self::tell`].
+    fn start(&mut self) {
+        for id in START {
+            let Some(step) = self.machine.asked(&Transition { id, label: String::new() }) else { return };
+            self.go(step);
+            let outcome = self.work(id);
+            if let Some(step) = self.machine.ended(outcome) {
+                self.go(step);
+            }
+        }
+    }
+
     /// Makes a transition with all that follows from it; whether its work went well.
     async fn change(&mut self, wanted: &Transition) -> bool {
         let Some(step) = self.machine.asked(wanted) else {
@@ -171,23 +189,26 @@ impl Manager {
             self.health.refuse("transition", &format!("no transition '{wanted}' (id {id}) from the state {label}"));
             return false;
         };
-        self.go(step).await;
-        let outcome = self.work(step.0).await;
+        self.go(step);
+        // Before the work, which may take its time.
+        self.tell().await;
+        let outcome = if step.0 == Transition::TRANSITION_CLEANUP { self.clean_up().await } else { self.work(step.0) };
         if let Some(step) = self.machine.ended(outcome) {
-            self.go(step).await;
+            self.go(step);
         }
         if self.machine.0 == State::TRANSITION_STATE_ERRORPROCESSING {
             // A node that can still forget is as good as new.
             self.activity.set(false);
             let outcome = if self.forget().await { Outcome::Success } else { Outcome::Failure };
             if let Some(step) = self.machine.ended(outcome) {
-                self.go(step).await;
+                self.go(step);
             }
         }
+        self.tell().await;
         outcome == Outcome::Success
     }
 
-    async fn go(&mut self, step: &Step) {
+    fn go(&mut self, step: &Step) {
         let (_, _, from, to) = *step;
         self.machine = Machine(to);
         let goal_state = state(to);
@@ -195,12 +216,24 @@ impl Manager {
         let now = self.clock.now();
         const NANOS: u64 = 1_000_000_000;
         let timestamp = u64::try_from(now.sec).unwrap_or_default() * NANOS + u64::from(now.nanosec);
-        let event = TransitionEvent { timestamp, transition: transition(step), start_state: state(from), goal_state };
-        // A closed output is that of a process that ends.
-        let _ = self.events.send(event).await;
+        self.untold.push(TransitionEvent {
+            timestamp,
+            transition: transition(step),
+            start_state: state(from),
+            goal_state,
+        });
     }
 
-    async fn work(&mut self, transition: u8) -> Outcome {
+    /// Tells those who listen of the steps made.
+    async fn tell(&mut self) {
+        for event in self.untold.drain(..) {
+            // A closed output is that of a process that ends.
+            let _ = self.events.send(event).await;
+        }
+    }
+
+    /// The work of a transition, but for cleaning up.
+    fn work(&mut self, transition: u8) -> Outcome {
         match transition {
             Transition::TRANSITION_CONFIGURE => match (self.check)() {
                 Ok(()) => Outcome::Success,
@@ -213,18 +246,15 @@ impl Manager {
                 self.activity.set(true);
                 Outcome::Success
             }
-            Transition::TRANSITION_CLEANUP => {
-                if self.forget().await {
-                    Outcome::Success
-                } else {
-                    Outcome::Error
-                }
-            }
             _ => {
                 self.activity.set(false);
                 Outcome::Success
             }
         }
+    }
+
+    async fn clean_up(&mut self) -> Outcome {
+        if self.forget().await { Outcome::Success } else { Outcome::Error }
     }
 
     /// Lets the node's loop forget; false where the loop has ended.
@@ -264,14 +294,15 @@ impl Session {
             check: Box::new(check),
             forget,
             events,
+            untold: Vec::new(),
         };
         self.health.lifecycle("unconfigured");
+        if autostart {
+            // Before anything runs that takes a call, a goal or a frame.
+            manager.start();
+        }
         self.spawn(async move {
-            if autostart {
-                for label in ["configure", "activate"] {
-                    manager.change(&Transition { id: 0, label: label.to_owned() }).await;
-                }
-            }
+            manager.tell().await;
             // A caller that has gone is no concern of the node.
             loop {
                 futures::select! {
@@ -325,6 +356,7 @@ mod tests {
             check: Box::new(check),
             forget,
             events,
+            untold: Vec::new(),
         };
         (manager, wishes, told)
     }
@@ -386,6 +418,15 @@ mod tests {
             "finalized",
         ];
         assert_eq!(told(events), expected);
+    }
+
+    #[test]
+    fn a_node_that_starts_is_active_before_anything_else_runs() {
+        let (mut manager, _wishes, events) = manager(|| Ok(()));
+        manager.start();
+        assert!(manager.activity.is_active());
+        smol::block_on(manager.tell());
+        assert_eq!(told(events), ["configuring", "inactive", "activating", "active"]);
     }
 
     #[test]

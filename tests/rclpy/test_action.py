@@ -1,16 +1,21 @@
 """The action `assemble`, from a client of rclpy."""
 
+import os
+
 import pytest
+import rclpy
 from action_msgs.msg import GoalStatus, GoalStatusArray
 from action_msgs.srv import CancelGoal
 from builtin_interfaces.msg import Duration
 from jigsaw_msgs.action import Assemble
-from jigsaw_msgs.msg import Assembly
+from jigsaw_msgs.msg import Assembly, PieceFeatures
 from rclpy.action import ActionClient
 from unique_identifier_msgs.msg import UUID
 
 from bench import SCALE, Camera
 from conftest import LATCHED
+
+ACKNOWLEDGEMENT = rclpy.duration.Duration(seconds=0.1)  # for which nothing else is done
 
 
 class Client:
@@ -30,10 +35,6 @@ class Client:
         )
         return self.ros.result(sent, "answer to the goal")
 
-    def begin(self, **goal):
-        """Sends a goal until it is accepted: a node that has just come up is not active yet for a moment."""
-        return self.ros.until(lambda: (handle := self.send(**goal)).accepted and handle, "accepted goal")
-
     def end(self, handle):
         response = self.ros.result(handle.get_result_async(), "result", 60)
         return response.status, response.result
@@ -52,7 +53,8 @@ def client(ros):
 def test_a_goal_is_reached_with_feedback_on_the_way(launcher, ros, generate, client):
     launcher.cell(*SCALE)
     puzzle = generate(2, 3, 5)
-    handle = client.begin(expected_pieces=6)
+    handle = client.send(expected_pieces=6)
+    assert handle.accepted
     Camera(ros).show_puzzle(puzzle)
     status, result = client.end(handle)
     assert status == GoalStatus.STATUS_SUCCEEDED and result.complete
@@ -68,9 +70,38 @@ def test_a_goal_is_reached_with_feedback_on_the_way(launcher, ros, generate, cli
     assert again.accepted and client.end(again)[0] == GoalStatus.STATUS_SUCCEEDED
 
 
+def test_a_goal_that_waits_for_a_node_to_start_is_accepted(launcher, ros, client, tmp_path):
+    """A client may find the server, and ask, before the node has begun to work. The node is kept from that by a file of
+    its journal that nobody has written yet."""
+    journal = tmp_path / "journal"
+    journal.mkdir()
+    slow = journal / "slow.piece"
+    os.mkfifo(slow)
+    solver = launcher.start("solver_node", "--ros-args", "-p", f"journal:={journal}")
+    # The node acknowledges what it has got. It meets the endpoints of a participant in the order in which they were
+    # made, and takes its messages in the order in which they were sent: so it knows the client, and then has the goal.
+    pieces = client.node.create_publisher(PieceFeatures, "pieces/features", LATCHED)
+
+    def reached():
+        ros.until(lambda: pieces.get_subscription_count(), "solver node")
+        pieces.publish(PieceFeatures())
+        ros.until(lambda: pieces.wait_for_all_acked(ACKNOWLEDGEMENT), "acknowledgement")
+
+    reached()
+    ros.until(client.client.server_is_ready, "action server")
+    sent = client.client.send_goal_async(Assemble.Goal(expected_pieces=5))
+    reached()
+    assert "journal" not in solver.text(), "the node has read its journal already"
+    slow.write_bytes(b"no piece")
+    handle = ros.result(sent, "answer to the goal")
+    assert handle.accepted
+    assert client.cancel(handle).return_code == CancelGoal.Response.ERROR_NONE
+
+
 def test_a_goal_ends_with_its_time(launcher, client):
     launcher.start("solver_node")
-    handle = client.begin(expected_pieces=5, time_budget=Duration(sec=1))
+    handle = client.send(expected_pieces=5, time_budget=Duration(sec=1))
+    assert handle.accepted
     status, result = client.end(handle)
     assert status == GoalStatus.STATUS_ABORTED
     assert not result.complete and not result.assembly.pieces
@@ -78,7 +109,8 @@ def test_a_goal_ends_with_its_time(launcher, client):
 
 def test_a_goal_is_called_off(launcher, client):
     launcher.start("solver_node")
-    handle = client.begin(expected_pieces=5)
+    handle = client.send(expected_pieces=5)
+    assert handle.accepted
     answer = client.cancel(handle)
     assert answer.return_code == CancelGoal.Response.ERROR_NONE
     assert [info.goal_id for info in answer.goals_canceling] == [handle.goal_id]
@@ -94,7 +126,8 @@ def test_one_goal_at_a_time(launcher, ros, client):
     statuses = []
     client.node.create_subscription(GoalStatusArray, "/assemble/_action/status", statuses.append, LATCHED)
     ros.until(other.client.server_is_ready, "action server")
-    first = client.begin(expected_pieces=2)
+    first = client.send(expected_pieces=2)
+    assert first.accepted
     assert client.cancel(first).return_code == CancelGoal.Response.ERROR_NONE
     assert client.end(first)[0] == GoalStatus.STATUS_CANCELED
     # Two at the same time: one of them is taken.
