@@ -422,17 +422,18 @@ pub(crate) fn coarse(
     fit(tab, mouth, (from.pose, from.clearance), scale, free, (COARSE_ROUNDS, COARSE_STRIDE), feet)
 }
 
-/// Refines a coarse fit on all nodes of the extended match segment.
+/// Refines a pose (of the tab's piece in the image of the mouth's) and its clearance on all nodes of the extended match
+/// segment.
 pub(crate) fn refine(
     tab: &Segment,
     mouth: &Segment,
-    from: &Fit,
+    (negative_from_positive, clearance): (&Isometry2<f64>, f64),
     scale: f64,
     free: bool,
     feet: &mut Feet,
 ) -> Option<Fit> {
-    let pose = Pose::between(tab, mouth, &from.negative_from_positive);
-    fit(tab, mouth, (pose, from.clearance), scale, free, (REFINEMENTS, 1), feet)
+    let pose = Pose::between(tab, mouth, negative_from_positive);
+    fit(tab, mouth, (pose, clearance), scale, free, (REFINEMENTS, 1), feet)
 }
 
 fn fit(

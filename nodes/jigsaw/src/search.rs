@@ -26,7 +26,7 @@ use crate::{Params, Policy, placement};
 use nalgebra::{Isometry2, Matrix3, Point2, Translation2, UnitComplex, Vector2, Vector3};
 use state::State;
 use std::cmp::Reverse;
-use std::collections::{BTreeMap, HashMap};
+use std::collections::{BTreeMap, HashMap, HashSet};
 
 /// Overlap of two pieces that can't be a matter of drift or clearance, in squared piece scales.
 const OVERLAP: f64 = 0.02;
@@ -74,9 +74,12 @@ pub(crate) struct Mated {
 /// The poses found.
 #[derive(Debug, Clone, Default)]
 pub(crate) struct Outcome {
+    /// The candidates, and behind them so many contacts that the assembly showed.
+    pub(crate) joints: Vec<Joint>,
+    pub(crate) contacts: usize,
     /// Island and pose (island from image) of each piece; `None` if left over.
     pub(crate) poses: Vec<Option<(usize, Isometry2<f64>)>>,
-    /// Loop support of each joint given.
+    /// Loop support of each joint.
     pub(crate) support: Vec<usize>,
     /// Matings of the assembly.
     pub(crate) matings: Vec<Mated>,
@@ -136,7 +139,11 @@ struct Assembler<'a> {
     params: &'a Params,
     memory: &'a Memory,
     budget: &'a dyn Budget,
+    joints: Vec<Joint>,
+    /// What the search needs of the joints, one by one.
     edges: Vec<Edge>,
+    /// How many of them were found as contacts.
+    contacts: usize,
     /// Candidates at each piece.
     at: Vec<Vec<usize>>,
     scale: f64,
@@ -155,10 +162,10 @@ struct Assembler<'a> {
     partial: bool,
 }
 
-/// Assembles; `joints` are in the order of ranks.
+/// Assembles; `joints`, the candidates, are in the order of ranks.
 pub(crate) fn assemble(
     outlines: &[&Outline],
-    joints: &[Joint],
+    joints: Vec<Joint>,
     params: &Params,
     memory: &Memory,
     budget: &dyn Budget,
@@ -170,21 +177,7 @@ pub(crate) fn assemble(
     let mut scales: Vec<f64> = outlines.iter().map(|o| o.scale).collect();
     let scale = *scales.select_nth_unstable_by(n / 2, f64::total_cmp).1;
     let slots = Slots::new(outlines);
-    let mut edges: Vec<Edge> = joints
-        .iter()
-        .map(|j| Edge {
-            a: j.a,
-            b: j.b,
-            slots: [slots.tab(j.a, j.tab), slots.mouth(j.b, j.mouth)],
-            b_from_a: j.fit.negative_from_positive,
-            covariance: covariance(&j.fit.information, outlines[j.b].scale),
-            at: outlines[j.b].mouths[j.mouth].origin,
-            cost: j.fit.residual.max(1e-4).ln(),
-            mouth_rank: 0,
-            tab_rank: 0,
-            support: 0,
-        })
-        .collect();
+    let mut edges: Vec<Edge> = joints.iter().map(|j| edge(j, outlines, &slots)).collect();
     rank(&mut edges, &slots);
     let mut at = vec![Vec::new(); n];
     for (k, e) in edges.iter().enumerate() {
@@ -197,7 +190,9 @@ pub(crate) fn assemble(
         params,
         memory,
         budget,
+        joints,
         edges,
+        contacts: 0,
         at,
         scale,
         prior: ClearancePrior { mean: 0.0, deviation: 0.01 * scale, noise: noise.max(0.02) },
@@ -214,8 +209,25 @@ pub(crate) fn assemble(
         partial: false,
     };
     match params.policy {
-        Policy::Standard => assembler.run(joints),
-        Policy::Paper => assembler.descend(joints),
+        Policy::Standard => assembler.run(),
+        Policy::Paper => assembler.descend(),
+    }
+}
+
+/// A joint as the search sees it.
+fn edge(joint: &Joint, outlines: &[&Outline], slots: &Slots) -> Edge {
+    let Joint { a, tab, b, mouth, fit } = joint;
+    Edge {
+        a: *a,
+        b: *b,
+        slots: [slots.tab(*a, *tab), slots.mouth(*b, *mouth)],
+        b_from_a: fit.negative_from_positive,
+        covariance: covariance(&fit.information, outlines[*b].scale),
+        at: outlines[*b].mouths[*mouth].origin,
+        cost: fit.residual.max(1e-4).ln(),
+        mouth_rank: 0,
+        tab_rank: 0,
+        support: 0,
     }
 }
 
@@ -254,13 +266,13 @@ fn spread_of(values: &mut [f64]) -> (f64, f64) {
 }
 
 impl Assembler<'_> {
-    fn run(&mut self, joints: &[Joint]) -> Outcome {
+    fn run(&mut self) -> Outcome {
         // Of pieces that are there twice one makes the puzzle: two would take each other's place.
         self.aside = copies(self.outlines);
         self.model = self.first_model();
         let outstanding = self.outstanding();
         self.learn(&outstanding);
-        let found = if self.params.loops { self.close_loops(joints) } else { Vec::new() };
+        let found = if self.params.loops { self.close_loops() } else { Vec::new() };
         self.islands(&found);
         let trusted: Vec<usize> = self.state.joined().to_vec();
         self.learn(&trusted);
@@ -285,13 +297,14 @@ impl Assembler<'_> {
             self.fill();
         }
         self.refine_all(FINAL_ROUNDS, FINE);
-        self.finish_sure(joints)
+        self.add_contacts();
+        self.finish_sure()
     }
 
     /// The outcome without the pieces and matings that are less sure than asked for.
-    fn finish_sure(&mut self, joints: &[Joint]) -> Outcome {
+    fn finish_sure(&mut self) -> Outcome {
         let least = self.params.minimum_confidence;
-        let mut outcome = self.finish(joints);
+        let mut outcome = self.finish();
         // Each round takes something out, so there are no more rounds than pieces and matings.
         for _ in 0..self.outlines.len() + self.state.joined().len() {
             let unsure: Vec<usize> = (0..self.outlines.len())
@@ -303,16 +316,18 @@ impl Assembler<'_> {
                 break;
             }
             self.detach(&unsure, &joined);
-            outcome = self.finish(joints);
+            outcome = self.finish();
         }
         outcome.matings.retain(|m| m.confidence >= least);
+        outcome.contacts = self.contacts;
+        outcome.joints = std::mem::take(&mut self.joints);
         outcome
     }
 
     /// The paper's assembly: down the ranked table, mating whatever fits without intolerable overlap; when pieces are
     /// left that can't be joined up, or mouths that nothing fills, back. Decisions are taken back by limited discrepancy search (Harvey and
     /// Ginsberg 1995): every descent that differs from the greedy one in one decision, the weakest first, then in two.
-    fn descend(&mut self, joints: &[Joint]) -> Outcome {
+    fn descend(&mut self) -> Outcome {
         let n = self.outlines.len();
         let mut ranked: Vec<usize> = (0..self.edges.len()).collect();
         ranked.sort_by(|p, q| self.edges[*p].cost.total_cmp(&self.edges[*q].cost).then(p.cmp(q)));
@@ -349,7 +364,7 @@ impl Assembler<'_> {
         }
         let trusted = self.state.joined().to_vec();
         self.learn(&trusted);
-        self.finish_sure(joints)
+        self.finish_sure()
     }
 
     /// Mouths of placed pieces in whose middle no other piece of their island lies.
@@ -379,7 +394,7 @@ impl Assembler<'_> {
 
     /// Finds loops among the best candidates to calibrate closure, clearance and residual, then, with what was learnt,
     /// among more. The best come first; what is more likely chance is left out.
-    fn close_loops(&mut self, joints: &[Joint]) -> Vec<loops::Loop> {
+    fn close_loops(&mut self) -> Vec<loops::Loop> {
         self.closure = self.first_guess();
         let (mut first, decoys) = self.ways(FIRST_RANKS).close();
         if self.params.recalibrate {
@@ -388,7 +403,7 @@ impl Assembler<'_> {
             let mut supported: Vec<usize> = sure.flat_map(|l| l.edges.iter().copied()).collect();
             supported.sort_unstable();
             supported.dedup();
-            self.calibrate(joints, &supported);
+            self.calibrate(&supported);
             rank(&mut self.edges, &self.slots);
             self.learn(&supported);
         }
@@ -452,8 +467,8 @@ impl Assembler<'_> {
     }
 
     /// Clearance and residual of true matings, from supported ones; costs follow.
-    fn calibrate(&mut self, joints: &[Joint], supported: &[usize]) {
-        let mut clearances: Vec<f64> = supported.iter().map(|k| joints[*k].fit.clearance).collect();
+    fn calibrate(&mut self, supported: &[usize]) {
+        let mut clearances: Vec<f64> = supported.iter().map(|k| self.joints[*k].fit.clearance).collect();
         let Some(mean) = median(&mut clearances) else { return };
         let mut off: Vec<f64> = clearances.iter().map(|c| (c - mean).abs()).collect();
         let deviation = 1.48 * median(&mut off).unwrap_or(0.0);
@@ -461,8 +476,8 @@ impl Assembler<'_> {
         self.prior.mean = mean;
         self.prior.deviation = deviation.max(0.002 * self.scale);
         for (k, e) in self.edges.iter_mut().enumerate() {
-            let z = (joints[k].fit.clearance - mean) / self.prior.deviation;
-            e.cost = joints[k].fit.residual.max(1e-4).ln() + 0.06 * (z * z).min(9.0);
+            let z = (self.joints[k].fit.clearance - mean) / self.prior.deviation;
+            e.cost = self.joints[k].fit.residual.max(1e-4).ln() + 0.06 * (z * z).min(9.0);
         }
     }
 
@@ -1069,7 +1084,48 @@ impl Assembler<'_> {
         }
     }
 
-    fn finish(&mut self, joints: &[Joint]) -> Outcome {
+    /// Tabs that lie in mouths although that was no candidate (others resembled either more): where nothing else is
+    /// joined, what the borders say there becomes a candidate. Of several at one stretch of border the nearest counts.
+    fn add_contacts(&mut self) {
+        /// Isthmus points of a tab and of its mouth are no farther apart, in piece scales: flat minima slide along the neck.
+        const NEAR: f64 = 0.15;
+        let agreeing = self.edges.iter().enumerate().filter(|(k, _)| self.same_island(*k) && self.agrees(*k));
+        let mut settled: HashSet<Slot> = agreeing.flat_map(|(_, e)| e.slots).collect();
+        let mut met: Vec<(f64, [usize; 2], [usize; 2])> = Vec::new();
+        for (p, q) in self.state.islands().flat_map(|k| self.neighbours(k)) {
+            for [a, b] in [[p, q], [q, p]] {
+                let b_from_a = self.state.pose[b].inverse() * self.state.pose[a];
+                for (tab, t) in self.outlines[a].tabs.iter().enumerate() {
+                    for (mouth, m) in self.outlines[b].mouths.iter().enumerate() {
+                        met.push(((b_from_a * t.origin - m.origin).norm(), [a, tab], [b, mouth]));
+                    }
+                }
+            }
+        }
+        met.retain(|(distance, _, [b, _])| *distance <= NEAR * self.outlines[*b].scale);
+        met.sort_by(|p, q| p.0.total_cmp(&q.0).then((p.1, p.2).cmp(&(q.1, q.2))));
+        let mut feet = placement::Feet::default();
+        for (_, [a, tab], [b, mouth]) in met {
+            let ends = [self.slots.tab(a, tab), self.slots.mouth(b, mouth)];
+            if ends.iter().any(|s| self.slots.rivals(*s).iter().any(|rival| settled.contains(rival))) {
+                continue;
+            }
+            let b_from_a = self.state.pose[b].inverse() * self.state.pose[a];
+            let (t, m) = (&self.outlines[a].tabs[tab], &self.outlines[b].mouths[mouth]);
+            let from = (&b_from_a, self.prior.mean);
+            let scale = self.outlines[b].scale;
+            let Some(fit) = placement::refine(t, m, from, scale, self.params.fit_clearance, &mut feet) else {
+                continue;
+            };
+            settled.extend(ends);
+            let joint = Joint { a, tab, b, mouth, fit };
+            self.edges.push(edge(&joint, self.outlines, &self.slots));
+            self.joints.push(joint);
+            self.contacts += 1;
+        }
+    }
+
+    fn finish(&mut self) -> Outcome {
         let n = self.outlines.len();
         let mut matings = Vec::new();
         let mut taken: HashMap<Slot, usize> = HashMap::new();
@@ -1083,8 +1139,9 @@ impl Assembler<'_> {
         let largest = self.state.largest();
         let stray = if paper { 1 } else { (largest / STRAY_SHARE).clamp(1, STRAY) };
         order.retain(|k| self.state.size(self.edges[*k].a) > stray);
-        order.sort_by(|p, q| joints[*p].fit.residual.total_cmp(&joints[*q].fit.residual).then(p.cmp(q)));
+        order.sort_by(|p, q| self.joints[*p].fit.residual.total_cmp(&self.joints[*q].fit.residual).then(p.cmp(q)));
         // Contacts that agree with a piece's pose: each beyond the first confirms it.
+        let candidates = self.edges.len() - self.contacts;
         let mut evidence = vec![0.0f64; n];
         let mut chosen = Vec::new();
         for k in order {
@@ -1094,9 +1151,11 @@ impl Assembler<'_> {
             if slots.iter().any(|s| taken.contains_key(s)) || (!paper && own + loops < IMPLAUSIBLE) {
                 continue;
             }
+            // What was only looked for because the pieces lie there is no further evidence that they do.
+            let more = if k < candidates { own.max(0.0) + AGREEMENT } else { 0.0 };
             for s in slots {
                 taken.insert(s, k);
-                evidence[s.piece] += own.max(0.0) + AGREEMENT;
+                evidence[s.piece] += more;
             }
             chosen.push(k);
         }
@@ -1112,7 +1171,7 @@ impl Assembler<'_> {
             let e = &self.edges[k];
             let b_from_a = self.state.pose[e.b].inverse() * self.state.pose[e.a];
             let contact = (!paper).then(|| self.contact_of(e.a, e.b, &b_from_a, FINE)).flatten();
-            let clearance = contact.map_or(joints[k].fit.clearance, |c| c.clearance);
+            let clearance = contact.map_or(self.joints[k].fit.clearance, |c| c.clearance);
             matings.push(Mated { joint: k, confidence: sure(least), clearance });
         }
         let confidence: Vec<f64> = evidence.iter().map(|e| sure((e - AGREEMENT).max(0.0))).collect();
@@ -1125,6 +1184,7 @@ impl Assembler<'_> {
             confidence,
             backtracks: self.backtracks,
             partial: self.partial,
+            ..Outcome::default()
         }
     }
 }

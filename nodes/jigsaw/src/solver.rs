@@ -187,7 +187,6 @@ pub struct Solver {
 #[derive(Debug, Clone)]
 struct Solution {
     order: Vec<usize>,
-    joints: Vec<Joint>,
     outcome: Outcome,
     table: TableCounts,
 }
@@ -317,7 +316,7 @@ impl Solver {
         self.kept.par_iter_mut().enumerate().for_each(|(k, kept)| {
             kept.outline.get_or_insert_with(|| Outline::new(&pieces[k], kept.serial));
         });
-        let (joints, table, whole) = if self.params.policy == Policy::Paper {
+        let (joints, mut table, whole) = if self.params.policy == Policy::Paper {
             paper::candidates(&ranked(&self.kept, &order), &|| budget.spent() >= MATCHING_SHARE)
         } else {
             let whole = self.match_new(&rank, budget);
@@ -328,13 +327,14 @@ impl Solver {
         let matched = Instant::now();
         self.memory.next_solution();
         let outlines = ranked(&self.kept, &order);
-        let outcome = search::assemble(&outlines, &joints, &self.params, &self.memory, budget);
-        let mut assembly = report(&order, &outlines, &joints, &outcome);
+        let outcome = search::assemble(&outlines, joints, &self.params, &self.memory, budget);
+        add_contacts(&mut table, &outlines, &outcome);
+        let mut assembly = report(&order, &outlines, &outcome);
         assembly.table = TableCounts { backtracks: outcome.backtracks, ..table };
         assembly.partial = outcome.partial || !whole;
         assembly.timings =
             Timings { matching: (matched - begin).as_secs_f64(), assembly: matched.elapsed().as_secs_f64() };
-        self.last = Some(Solution { order, joints, outcome, table });
+        self.last = Some(Solution { order, outcome, table });
         assembly
     }
 
@@ -425,7 +425,8 @@ impl Solver {
     /// figures and its fate. Of small puzzles (up to 25 000 pairs, some 60 pieces) every pair is listed, and the rows
     /// add up to [`Assembly::table`]; of larger ones only the pairs that were refined are, and the rest is counted there.
     pub fn candidates(&self) -> Vec<Candidate> {
-        let Some(Solution { order, joints, outcome, table }) = &self.last else { return Vec::new() };
+        let Some(Solution { order, outcome, table }) = &self.last else { return Vec::new() };
+        let joints = &outcome.joints;
         let outlines = ranked(&self.kept, order);
         let mut mated = vec![false; joints.len()];
         let mut taken = std::collections::HashSet::new();
@@ -524,7 +525,7 @@ fn hopeless(joint: &Joint, mouth: &Outline) -> bool {
 }
 
 /// Turns ranks into indices and lays the islands out.
-fn report(order: &[usize], outlines: &[&Outline], joints: &[Joint], outcome: &Outcome) -> Assembly {
+fn report(order: &[usize], outlines: &[&Outline], outcome: &Outcome) -> Assembly {
     let mut islands: std::collections::BTreeMap<usize, Vec<usize>> = std::collections::BTreeMap::new();
     for (k, pose) in outcome.poses.iter().enumerate() {
         if let Some((island, _)) = pose {
@@ -550,7 +551,7 @@ fn report(order: &[usize], outlines: &[&Outline], joints: &[Joint], outcome: &Ou
     }
     assembly.unplaced = (0..order.len()).filter(|k| !placed[*k]).map(|k| order[k]).collect();
     let mating = |mated: &Mated| {
-        let j = &joints[mated.joint];
+        let j = &outcome.joints[mated.joint];
         let (tab, mouth) = (&outlines[j.a].tabs[j.tab], &outlines[j.b].mouths[j.mouth]);
         Mating {
             positive_piece: order[j.a],
@@ -578,6 +579,19 @@ fn count(outlines: &[&Outline], joints: &[Joint], near: usize) -> TableCounts {
     table.after_correlation = near;
     table.after_overlap = joints.iter().filter(|j| !hopeless(j, outlines[j.b])).count();
     table
+}
+
+/// Counts the contacts that the assembly found among what each rule left: they are matings, whatever the rule said.
+fn add_contacts(table: &mut TableCounts, outlines: &[&Outline], outcome: &Outcome) {
+    for j in &outcome.joints[outcome.joints.len() - outcome.contacts..] {
+        let (windows, tab, mouth) =
+            (windows(outlines[j.b]), &outlines[j.a].tabs[j.tab], &outlines[j.b].mouths[j.mouth]);
+        let opens = windows.let_opening_pass(mouth, tab);
+        table.after_opening += usize::from(!opens);
+        table.after_length += usize::from(!(opens && windows.let_path_pass(mouth, tab)));
+        table.after_correlation += 1;
+        table.after_overlap += usize::from(!hopeless(j, outlines[j.b]));
+    }
 }
 
 /// How many pairs pass the opening window, and how many the window of path lengths as well: counted by a sweep over the
@@ -683,7 +697,8 @@ fn refine(
     for &place in &fine {
         let m = &mut list[place];
         if let (Some(coarse), None) = (&m.coarse, &m.fine) {
-            m.fine = placement::refine(tab(m), mouth, coarse, scale, free, feet);
+            let from = (&coarse.negative_from_positive, coarse.clearance);
+            m.fine = placement::refine(tab(m), mouth, from, scale, free, feet);
         }
     }
     let fit = |k: usize| if fine.contains(&k) { list[k].fine } else { list[k].coarse };

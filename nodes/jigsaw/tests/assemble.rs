@@ -50,6 +50,16 @@ fn incomplete_and_mixed_heaps_make_no_wrong_mating() {
     }
 }
 
+/// Pieces that others hold in place mate with all their neighbours, whether the index thought so or not.
+#[test]
+fn a_contact_is_a_mating_even_if_it_was_no_candidate() {
+    let options = Options { similarity: 0.95, seed: 5, ..Options::default() };
+    let (score, assembly) = solve(&options, &Params { candidates: 1, ..Params::default() });
+    assert!(score.is_perfect() && score.right_matings == score.joints, "{score:?}");
+    // With one candidate a mouth, what is beyond one a mouth was found in contact.
+    assert!(assembly.table.after_correlation > assembly.table.negative, "{:?}", assembly.table);
+}
+
 #[test]
 fn clearance_is_measured_joint_by_joint() {
     /// Greatest error of a joint's clearance on exact outlines, in pixels.

@@ -26,9 +26,9 @@ fn dropped(rows: &[Candidate], rules: &[Rule]) -> usize {
 #[test]
 fn the_table_explains_every_pair_of_a_small_puzzle() {
     let pieces = pieces(&Options { rows: 3, columns: 4, clearance: [1.0, 1.0], seed: 6, ..Options::default() });
-    for policy in [Policy::Standard, Policy::Paper] {
-        // So few candidates that the shape index has to choose.
-        let mut solver = solver(&pieces, Params { policy, candidates: 6, backtracks: 20, ..Params::default() });
+    // So few candidates that the shape index has to choose; one of each mouth is so few that contacts make up for some.
+    for (policy, candidates) in [(Policy::Standard, 6), (Policy::Standard, 1), (Policy::Paper, 6)] {
+        let mut solver = solver(&pieces, Params { policy, candidates, backtracks: 20, ..Params::default() });
         let assembly = solver.solve();
         let (rows, t) = (solver.candidates(), assembly.table);
         assert_eq!(rows.len(), t.pairs, "{policy:?}");
@@ -46,7 +46,8 @@ fn the_table_explains_every_pair_of_a_small_puzzle() {
         assert_eq!(dropped(&rows, fourth), t.after_correlation - t.after_overlap, "{policy:?} {t:?}");
         assert_eq!(mated + dropped(&rows, &[Rule::Rival, Rule::Support]), t.after_overlap, "{policy:?} {t:?}");
         assert_eq!(mated, assembly.matings.len(), "{policy:?}");
-        assert!(dropped(&rows, fourth) > 0 && dropped(&rows, &[Rule::Opening]) > 0, "{policy:?} {t:?}");
+        assert!(candidates == 1 || dropped(&rows, fourth) > 0, "{policy:?} {t:?}");
+        assert!(dropped(&rows, &[Rule::Opening]) > 0, "{policy:?} {t:?}");
         assert!(policy == Policy::Paper || dropped(&rows, third) > 0, "{t:?}");
         // What was dropped before it was posed has no pose, and what is mated has one.
         assert!(rows.iter().filter(|c| c.fate == Fate::Mated).all(|c| c.posed.is_some()));
