@@ -248,7 +248,7 @@ impl Equations {
 /// Follows the border of `a` along that of `b`, within `band` pixels of it, every `stride`-th point.
 fn follow(a: &Outline, b: &Outline, b_from_a: &Isometry2<f64>, band: f64, stride: usize) -> Option<Equations> {
     /// Normals of borders in contact are opposite to within 45°.
-    const OPPOSED: f32 = -0.7;
+    const OPPOSED: f64 = -0.7;
     let reach = (b.radius + band).powi(2);
     let rotation = b_from_a.rotation;
     let mut rows: Vec<(f64, Vector2<f64>, Point)> = Vec::new();
@@ -257,19 +257,12 @@ fn follow(a: &Outline, b: &Outline, b_from_a: &Isometry2<f64>, band: f64, stride
         if (p - b.centroid).norm_squared() > reach {
             continue;
         }
-        let Some(cell) = b.raster.cell_of(p) else { continue };
-        if f64::from(b.raster.distance[cell]).abs() > band + b.raster.cell {
+        let Some(foot) = b.foot(p, band) else { continue };
+        if foot.normal.dot(&(rotation * a.normals[k].cast::<f64>())) > OPPOSED {
             continue;
         }
-        let (i, other, part) = b.foot(p, b.raster.nearest[cell] as usize);
-        let (q, edge) = (b.points[i], b.points[other] - b.points[i]);
-        let normal = b.normals[i] * (1.0 - part as f32) + b.normals[other] * part as f32;
-        let mine = rotation * Vector2::new(f64::from(a.normals[k].x), f64::from(a.normals[k].y));
-        if normal.x * mine.x as f32 + normal.y * mine.y as f32 > OPPOSED {
-            continue;
-        }
-        let normal = Vector2::new(f64::from(normal.x), f64::from(normal.y)).normalize();
-        let distance = (p - (q + edge * part)).dot(&normal);
+        let normal = foot.normal.normalize();
+        let distance = foot.offset.dot(&normal);
         if distance.abs() <= band {
             rows.push((distance, normal, p));
         }

@@ -33,7 +33,8 @@ pub struct Piece {
     pub features: isthmus::Features,
 }
 
-/// Counts of the candidate table after each rule (paper, section on heuristics).
+/// Counts of the candidate table after each rule (paper, section on heuristics). Contacts that only the assembly showed
+/// count as left by all rules.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, serde::Serialize)]
 pub struct TableCounts {
     /// Positive isthmuses.

@@ -89,6 +89,15 @@ pub(crate) struct Raster {
     pub(crate) pole: Point,
 }
 
+/// Where a point's nearest border point lies.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(crate) struct Foot {
+    /// From there to the point.
+    pub(crate) offset: Vector2<f64>,
+    /// Outward normal of the border there, not quite of length one between two border points.
+    pub(crate) normal: Vector2<f64>,
+}
+
 /// A piece made ready.
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) struct Outline {
@@ -188,9 +197,21 @@ impl Outline {
         a + (b - a) * (s - i)
     }
 
+    /// The border next to a point that lies within `reach` of it.
+    pub(crate) fn foot(&self, p: Point, reach: f64) -> Option<Foot> {
+        let cell = self.raster.cell_of(p)?;
+        if f64::from(self.raster.distance[cell]).abs() > reach + self.raster.cell {
+            return None;
+        }
+        let (i, other, part) = self.walk(p, self.raster.nearest[cell] as usize);
+        let normal = self.normals[i] * (1.0 - part as f32) + self.normals[other] * part as f32;
+        let at = self.points[i] + (self.points[other] - self.points[i]) * part;
+        Some(Foot { offset: p - at, normal: normal.cast() })
+    }
+
     /// Foot of a point on the border, downhill from the border point `from`: a border point, the neighbour towards which
     /// the foot lies, and which part of the way.
-    pub(crate) fn foot(&self, p: Point, from: usize) -> (usize, usize, f64) {
+    fn walk(&self, p: Point, from: usize) -> (usize, usize, f64) {
         let n = self.points.len();
         let mut i = from;
         let mut best = (p - self.points[i]).norm_squared();
@@ -215,15 +236,9 @@ impl Outline {
     /// Signed distance of a point from the border, positive outside, if it is less than `reach`, and the normal of the
     /// border there (outward).
     pub(crate) fn gap(&self, p: Point, reach: f64) -> Option<(f64, Vector2<f64>)> {
-        let cell = self.raster.cell_of(p)?;
-        if f64::from(self.raster.distance[cell]).abs() > reach + self.raster.cell {
-            return None;
-        }
-        let (i, other, part) = self.foot(p, self.raster.nearest[cell] as usize);
-        let normal = self.normals[i] * (1.0 - part as f32) + self.normals[other] * part as f32;
-        let normal = Vector2::new(f64::from(normal.x), f64::from(normal.y));
-        let d = p - (self.points[i] + (self.points[other] - self.points[i]) * part);
-        (d.norm() <= reach).then(|| (d.norm().copysign(d.dot(&normal)), normal))
+        let Foot { offset, normal } = self.foot(p, reach)?;
+        let distance = offset.norm();
+        (distance <= reach).then(|| (distance.copysign(offset.dot(&normal)), normal))
     }
 
     fn prepare(&self, index: usize, isthmus: &Isthmus) -> Segment {

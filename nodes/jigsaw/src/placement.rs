@@ -459,33 +459,14 @@ fn fit(
     let cap = RESIDUAL_CAP * scale;
     let residual = feet.residual(feet.points(), clearance, cap);
     let information = feet.information(clearance, limit, free) * stride as f64;
-    Some(Fit { information, ..figures(tab, mouth, feet, &pose, clearance, (residual, cap), tab.step * stride as f64) })
-}
-
-/// The figures of a finished refinement.
-fn figures(
-    tab: &Segment,
-    mouth: &Segment,
-    feet: &Feet,
-    pose: &Pose,
-    clearance: f64,
-    (residual, cap): (f64, f64),
-    step: f64,
-) -> Fit {
     let (mut pos_gap, mut neg_gap) = (0.0, 0.0);
     for distance in feet.distances(feet.core.clone()) {
-        let area = f64::from(distance) * step;
+        let area = f64::from(distance) * tab.step * stride as f64;
         if area < 0.0 { pos_gap -= area } else { neg_gap += area }
     }
-    Fit {
-        negative_from_positive: pose.between_images(tab, mouth),
-        clearance,
-        residual,
-        ave_gap: feet.residual(feet.core.clone(), clearance, cap),
-        pos_gap,
-        neg_gap,
-        information: Matrix3::identity(),
-    }
+    let ave_gap = feet.residual(feet.core.clone(), clearance, cap);
+    let negative_from_positive = pose.between_images(tab, mouth);
+    Some(Fit { negative_from_positive, clearance, residual, ave_gap, pos_gap, neg_gap, information })
 }
 
 /// Best rigid pose that takes points `a` to points `b`, pair by pair as far as both go (Umeyama 1991 without scale).

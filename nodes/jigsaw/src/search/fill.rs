@@ -14,10 +14,13 @@
 //! Complexity O(pieces left · candidates · neighbours · border) in each round; a round places all that are sure. A piece
 //! that touches the assembly nowhere, or that strangers equal, stays left over.
 
-use super::{Assembler, COARSE, FOUND, Model, STRAY_SHARE, spread_of};
+use super::Assembler;
+use super::adjust::COARSE;
+use super::learn::{FOUND, Model, spread_of};
+use super::outcome::STRAY_SHARE;
 use crate::posegraph::{Factor, minimise};
 use isthmus::Point;
-use nalgebra::{Isometry2, Matrix6, Translation2, UnitComplex, Vector2, Vector6};
+use nalgebra::{Isometry2, Matrix6, Vector2, Vector6};
 use rayon::prelude::*;
 
 /// Border farther than this from any other, in piece scales, lies open and says nothing.
@@ -322,10 +325,7 @@ impl Assembler<'_> {
                 return settled;
             }
             let centre = settled * self.outlines[piece].centroid;
-            let motion = minimise(&[centre, centre], &factors)[1];
-            let shift = motion.xy().cap_magnitude(CAP * self.scale);
-            let turn = UnitComplex::new(motion.z.clamp(-CAP, CAP));
-            settled = Translation2::from(centre.coords + shift) * turn * Translation2::from(-centre.coords) * settled;
+            settled = self.moved(piece, &settled, &minimise(&[centre, centre], &factors)[1]);
         }
         settled
     }

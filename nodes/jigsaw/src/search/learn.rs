@@ -1,0 +1,224 @@
+//! What is learnt from the puzzle itself: how right and wrong candidates differ, and which of them close loops.
+//!
+//! The cost of a candidate is the logarithm of its residual, and how unusual its clearance is besides. Right ones are
+//! those in loops (the best of which show how the puzzle's loops close, and what its clearance is), wrong ones the best
+//! others of the same mouths. Before any loop is known, and where there are none, the candidates that stand out serve.
+//! The logarithm of how much likelier a cost is for a right candidate than for a wrong one is its evidence; all
+//! decisions of the search are taken on sums of it.
+
+use super::Assembler;
+use crate::loops::{self, Closure, Edge, Tolerance};
+use crate::slots::{Slot, Slots};
+
+/// Loops of refined poses close to within this on real pieces (0.8 % and 0.44° measured); calibration tightens it.
+const LOOSE: Tolerance = Tolerance { position: 0.04, angle: 0.05 };
+/// True loops close this many times as wide as the borders' residuals say, as a first guess: neighbouring residuals
+/// are alike (1 to 2 on generated pieces, 4 to 12 on real ones, which don't keep their shape exactly).
+const STIFFNESS: f64 = 3.0;
+/// Candidates of each mouth (and tab) that take part in loops: more and chance loops drown the true ones.
+const LOOP_RANKS: usize = 6;
+/// The same for the loops by which the puzzle is calibrated.
+const FIRST_RANKS: usize = 2;
+
+/// Costs (logarithms of residuals) of right candidates, and of the best wrong one beside each: mean and deviation.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Model {
+    pub(super) right: (f64, f64),
+    pub(super) wrong: (f64, f64),
+}
+
+impl Model {
+    /// From mean and deviation of either. Deviations are kept within what is reasonable: never so narrow that a good
+    /// candidate looks bad, never so wide that everything looks alike. Wrong ones cost no less and spread no less than
+    /// right ones, so that a greater cost is never better evidence.
+    pub(super) fn between(right: (f64, f64), wrong: (f64, f64)) -> Self {
+        let right = (right.0.min(wrong.0), right.1.clamp(0.15, 0.5));
+        Self { right, wrong: (wrong.0, wrong.1.clamp(0.2, 0.7).max(right.1)) }
+    }
+
+    /// Logarithm of how much likelier a cost is for a right candidate than for the best wrong one of a mouth.
+    pub(super) fn evidence(&self, cost: f64) -> f64 {
+        let density = |(mean, deviation): (f64, f64)| {
+            let z = (cost.max(self.right.0) - mean) / deviation;
+            -0.5 * z * z - f64::ln(deviation)
+        };
+        (density(self.right) - density(self.wrong)).clamp(-STRONG, STRONG)
+    }
+}
+
+/// Evidence beyond which more doesn't count (natural logarithm of odds).
+pub(super) const STRONG: f64 = 12.0;
+/// Evidence of one more candidate that agrees on a pose, or of one closed loop: chance agreement is rarer than this.
+pub(super) const AGREEMENT: f64 = 4.0;
+/// Evidence that a join must have: odds of twenty to one.
+pub(super) const ACCEPT: f64 = 3.0;
+/// Evidence that a loop must have, on which all else is built: odds of a hundred to one.
+pub(super) const FOUND: f64 = 4.5;
+/// Evidence below which a candidate is no mating, whatever supports it.
+pub(super) const IMPLAUSIBLE: f64 = -6.0;
+/// Most that one candidate counts against the pose that it shares with others.
+pub(super) const WORN: f64 = -3.0;
+impl Assembler<'_> {
+    /// Finds loops among the best candidates to calibrate closure, clearance and residual, then, with what was learnt,
+    /// among more. The best come first; what is more likely chance is left out.
+    pub(super) fn close_loops(&mut self) -> Vec<loops::Loop> {
+        self.closure = self.first_guess();
+        let (mut first, decoys) = self.ways(FIRST_RANKS).close();
+        if self.params.recalibrate {
+            self.closure = self.weigh(&decoys, &mut first);
+            let sure = first.iter().filter(|l| l.evidence >= FOUND);
+            let mut supported: Vec<usize> = sure.flat_map(|l| l.edges.iter().copied()).collect();
+            supported.sort_unstable();
+            supported.dedup();
+            self.calibrate(&supported);
+            rank(&mut self.edges, &self.slots);
+            self.learn(&supported);
+        }
+        // The fewer candidates take part, the fewer loops close by chance: those of the best ones say more.
+        let (all, more_decoys) = self.ways(LOOP_RANKS).close();
+        let among = |l: &loops::Loop| l.edges.iter().all(|k| self.among(*k, FIRST_RANKS));
+        let (mut best, others): (Vec<loops::Loop>, Vec<loops::Loop>) = all.into_iter().partition(among);
+        self.weigh(&decoys, &mut best);
+        let mut found = best;
+        found.extend(others);
+        self.closure = self.weigh(&more_decoys, &mut found);
+        self.sorted(found)
+    }
+
+    /// Whether a candidate is among so many of its mouth and of its tab, and its pieces don't wait.
+    fn among(&self, k: usize, ranks: usize) -> bool {
+        self.edges[k].mouth_rank < ranks && self.edges[k].tab_rank < ranks && !self.waits(k)
+    }
+
+    /// The ways along the best candidates.
+    fn ways(&self, ranks: usize) -> loops::Ways<'_> {
+        let active: Vec<usize> = (0..self.edges.len()).filter(|k| self.among(*k, ranks)).collect();
+        loops::Ways::new((&self.edges, &active), (self.outlines, &self.slots), LOOSE)
+    }
+
+    /// How loops close, beside those of decoys; gives each loop the evidence that follows, unless it has more already.
+    fn weigh(&self, decoys: &loops::Decoys, found: &mut [loops::Loop]) -> Closure {
+        let closure = Closure::fit(&self.first_guess(), found, decoys);
+        for l in found {
+            l.evidence = l.evidence.max(closure.evidence(l.distance));
+        }
+        closure
+    }
+
+    /// How loops should close, by the residuals of the best candidates and the tolerance of the search.
+    fn first_guess(&self) -> Closure {
+        let best = self.edges.iter().filter(|e| e.mouth_rank == 0);
+        let residual = median(&mut best.clone().map(|e| e.cost.exp()).collect::<Vec<f64>>()).unwrap_or(1.0);
+        // The box of the tolerance, in units of what four candidates leave open.
+        let open = |e: &Edge| (64.0 * e.covariance.determinant()).max(f64::MIN_POSITIVE).sqrt();
+        let open = median(&mut best.map(open).collect::<Vec<f64>>()).unwrap_or(1.0);
+        let volume = (LOOSE.position * self.scale).powi(2) * LOOSE.angle;
+        Closure::guess(STIFFNESS * residual, (volume / open).cbrt())
+    }
+
+    /// Counts what supports what, leaves out loops that are more likely chance, and puts the best first.
+    fn sorted(&mut self, found: Vec<loops::Loop>) -> Vec<loops::Loop> {
+        let value = |l: &loops::Loop| {
+            let costs = l.edges.iter().map(|k| self.model.evidence(self.edges[*k].cost).max(WORN));
+            l.evidence + costs.sum::<f64>()
+        };
+        let mut keyed: Vec<(f64, loops::Loop)> = found.into_iter().map(|l| (value(&l), l)).collect();
+        keyed.retain(|(value, l)| *value >= FOUND && l.evidence >= 0.0);
+        keyed.sort_by(|p, q| q.0.total_cmp(&p.0).then_with(|| p.1.edges.cmp(&q.1.edges)));
+        for (_, l) in &keyed {
+            for &k in &l.edges {
+                self.edges[k].support += 1;
+            }
+        }
+        keyed.into_iter().map(|(_, l)| l).collect()
+    }
+
+    /// Clearance and residual of true matings, from supported ones; costs follow.
+    fn calibrate(&mut self, supported: &[usize]) {
+        let mut clearances: Vec<f64> = supported.iter().map(|k| self.joints[*k].fit.clearance).collect();
+        let Some(mean) = median(&mut clearances) else { return };
+        let mut off: Vec<f64> = clearances.iter().map(|c| (c - mean).abs()).collect();
+        let deviation = 1.48 * median(&mut off).unwrap_or(0.0);
+        // Small sets measure the deviation badly, and clearances may differ from cut to cut.
+        self.prior.mean = mean;
+        self.prior.deviation = deviation.max(0.002 * self.scale);
+        for (k, e) in self.edges.iter_mut().enumerate() {
+            let z = (self.joints[k].fit.clearance - mean) / self.prior.deviation;
+            e.cost = self.joints[k].fit.residual.max(1e-4).ln() + 0.06 * (z * z).min(9.0);
+        }
+    }
+
+    /// Learns what right and wrong candidates cost: right ones are those `trusted`, wrong ones the best others of
+    /// their mouths.
+    pub(super) fn learn(&mut self, trusted: &[usize]) {
+        /// Fewer say too little about the spread.
+        const FEW: usize = 4;
+        let mut right: Vec<f64> = trusted.iter().map(|k| self.edges[*k].cost).collect();
+        let mut wrong = Vec::new();
+        for &k in trusted {
+            let mouth = self.edges[k].slots[1];
+            let others = self.at[mouth.piece].iter().map(|j| (*j, &self.edges[*j]));
+            let best =
+                others.filter(|(j, e)| *j != k && e.slots[1] == mouth).map(|(_, e)| e.cost).min_by(f64::total_cmp);
+            wrong.extend(best);
+        }
+        if right.len() < FEW || wrong.len() < FEW {
+            return;
+        }
+        self.model = Model::between(spread_of(&mut right), spread_of(&mut wrong));
+    }
+
+    /// Before anything is trusted: right candidates cost what noise and sampling make them, wrong ones what the second
+    /// and third of the mouths do.
+    pub(super) fn first_model(&self) -> Model {
+        let runners_up = self.edges.iter().filter(|e| (1..=2).contains(&e.mouth_rank));
+        match spread_of(&mut runners_up.map(|e| e.cost).collect::<Vec<f64>>()) {
+            (_, 0.0) => self.model,
+            wrong => Model::between(self.model.right, wrong),
+        }
+    }
+
+    /// Candidates that are the best of their tab and of their mouth by a wide margin: what to learn from without loops.
+    pub(super) fn outstanding(&self) -> Vec<usize> {
+        const WIDE: f64 = 0.7; // half the residual of any rival
+        (0..self.edges.len())
+            .filter(|&k| {
+                let e = &self.edges[k];
+                let clear = |slot: Slot| {
+                    self.at[slot.piece].iter().all(|j| {
+                        *j == k || !self.edges[*j].slots.contains(&slot) || self.edges[*j].cost > e.cost + WIDE
+                    })
+                };
+                e.mouth_rank == 0 && e.tab_rank == 0 && e.slots.into_iter().all(clear)
+            })
+            .collect()
+    }
+}
+
+/// Ranks the candidates of each mouth and tab by cost.
+pub(super) fn rank(edges: &mut [Edge], slots: &Slots) {
+    let mut order: Vec<usize> = (0..edges.len()).collect();
+    order.sort_unstable_by(|p, q| edges[*p].cost.total_cmp(&edges[*q].cost).then(p.cmp(q)));
+    let mut counts = vec![0; slots.count()];
+    for k in order {
+        let [tab, mouth] = edges[k].slots.map(|s| s.number);
+        (edges[k].tab_rank, edges[k].mouth_rank) = (counts[tab], counts[mouth]);
+        counts[tab] += 1;
+        counts[mouth] += 1;
+    }
+}
+
+pub(super) fn median(values: &mut [f64]) -> Option<f64> {
+    if values.is_empty() {
+        return None;
+    }
+    let middle = values.len() / 2;
+    Some(*values.select_nth_unstable_by(middle, f64::total_cmp).1)
+}
+
+/// Median and robust deviation.
+pub(super) fn spread_of(values: &mut [f64]) -> (f64, f64) {
+    let middle = median(values).unwrap_or(0.0);
+    let mut off: Vec<f64> = values.iter().map(|v| (v - middle).abs()).collect();
+    (middle, 1.48 * median(&mut off).unwrap_or(0.0))
+}
