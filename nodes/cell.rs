@@ -1,6 +1,6 @@
 //! The composed cell: the three nodes in one process, joined by channels instead of DDS.
 //!
-//! Camera topics, services, parameters and results are on DDS as ever; `pieces/image` and `pieces/features` are not.
+//! Camera topics, services, parameters and results are on DDS as ever; `pieces/image`, `pieces/features` and `pieces/reset` are not.
 //! The nodes keep their names, so that `-p solver_node:policy:=paper` or a parameter file addresses one of them. A
 //! parameter without a node goes to every node that has it.
 
@@ -58,8 +58,9 @@ fn node(process: &mut Process, program: Program) -> Result<Session, ProcessError
 fn open(process: &mut Process) -> Result<Work, ProcessError> {
     let (to_feature, pieces) = mpsc::channel(CHANNEL_DEPTH);
     let (to_solver, features) = mpsc::channel(CHANNEL_DEPTH);
-    let solver = solver::open(node(process, solver::PROGRAM)?, features)?;
+    let (to_capture, resets) = mpsc::channel(CHANNEL_DEPTH);
+    let solver = solver::open(node(process, solver::PROGRAM)?, features, to_capture)?;
     let feature = feature::open(node(process, feature::PROGRAM)?, pieces, to_solver)?;
-    let capture = capture::open(node(process, capture::PROGRAM)?, to_feature)?;
+    let capture = capture::open(node(process, capture::PROGRAM)?, resets, to_feature)?;
     Ok(Box::pin(async move { future::try_join3(capture, feature, solver).await.map(drop) }))
 }

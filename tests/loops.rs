@@ -59,7 +59,7 @@ fn settings(specs: &'static [Spec], health: &Arc<Health>) -> Settings {
 fn run_capture(frames: Vec<Frame>, calls: Vec<Call<Trigger>>, health: &Arc<Health>) -> Vec<PieceImage> {
     let (sender, receiver) = mpsc::unbounded();
     let settings = settings(capture::params::PARAMETERS, health);
-    let requests = capture::Requests { calls: stream::iter(calls), forgets: stream::empty() };
+    let requests = capture::Requests { calls: stream::iter(calls), forgets: stream::empty(), resets: stream::empty() };
     smol::block_on(capture::run(stream::iter(frames), requests, sender, settings));
     smol::block_on(receiver.collect())
 }
@@ -95,7 +95,9 @@ fn run_solver_with_goals(
     let (transform, transforms) = mpsc::channel(room);
     let (marker, markers) = mpsc::channel(room);
     let (solutions, _) = mpsc::unbounded();
-    let outputs = solver::Outputs { assembly, transforms: transform, markers: marker, solutions, journal: None };
+    let (told, _) = mpsc::channel(room);
+    let outputs =
+        solver::Outputs { assembly, transforms: transform, markers: marker, resets: told, solutions, journal: None };
     let settings = settings(solver::params::PARAMETERS, health);
     let requests = solver::Requests {
         resets: stream::iter(resets),

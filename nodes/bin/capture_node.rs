@@ -2,12 +2,9 @@
 
 use std::process::ExitCode;
 
-use jigsaw_nodes::capture::{PROGRAM, open};
-use jigsaw_nodes::ros::{process, topics};
+use jigsaw_nodes::capture::{PROGRAM, open_with_topics};
+use jigsaw_nodes::ros::process;
 
 fn main() -> ExitCode {
-    process::main(PROGRAM, |mut session| {
-        let (pieces, _) = session.publish(&topics::PIECE_IMAGE)?;
-        open(session, pieces)
-    })
+    process::main(PROGRAM, open_with_topics)
 }

@@ -2,12 +2,9 @@
 
 use std::process::ExitCode;
 
-use jigsaw_nodes::ros::{process, topics};
-use jigsaw_nodes::solver::{PROGRAM, open};
+use jigsaw_nodes::ros::process;
+use jigsaw_nodes::solver::{PROGRAM, open_with_topics};
 
 fn main() -> ExitCode {
-    process::main(PROGRAM, |mut session| {
-        let features = session.subscribe(&topics::PIECE_FEATURES)?;
-        open(session, features)
-    })
+    process::main(PROGRAM, open_with_topics)
 }

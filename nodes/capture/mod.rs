@@ -20,6 +20,7 @@ use futures::{Sink, SinkExt, Stream, StreamExt};
 use isthmus::mask::{self, Cutout};
 use jigsaw_msgs::builtin_interfaces::msg::Time;
 use jigsaw_msgs::msg::PieceImage;
+use jigsaw_msgs::std_msgs::msg::Empty;
 use jigsaw_msgs::std_srvs::srv::{Trigger, TriggerResponse};
 
 use crate::ros::activity::WhileInactive;
@@ -37,7 +38,8 @@ use source::Frame;
 pub const PROGRAM: Program = Program {
     name: "capture_node",
     about: "Cuts camera frames into jigsaw pieces.\n\n\
-            Topics in:  image (sensor_msgs/Image), image/compressed (sensor_msgs/CompressedImage)\n\
+            Topics in:  image (sensor_msgs/Image), image/compressed (sensor_msgs/CompressedImage),\n            \
+            pieces/reset (std_msgs/Empty)\n\
             Topic out:  pieces/image (jigsaw_msgs/PieceImage)\n\
             Service:    capture (std_srvs/Trigger): take the pieces in view, or the folder, again",
     parameters: params::PARAMETERS,
@@ -76,11 +78,26 @@ impl Heard {
     }
 }
 
-/// Opens the topics and services of the node and gives its loop, which sends the pieces to `pieces`.
+/// Opens the node with its own topics and gives its loop.
+///
+/// # Errors
+/// As for [`open`].
+pub fn open_with_topics(mut session: Session) -> Result<Work, ProcessError> {
+    let (pieces, _) = session.publish(&topics::PIECE_IMAGE)?;
+    let resets = session.subscribe(&topics::PIECES_RESET)?;
+    open(session, resets, pieces)
+}
+
+/// Opens the topics and services of the node and gives its loop, which sends the pieces to `pieces`, and those in view
+/// anew after each of the `resets`.
 ///
 /// # Errors
 /// An empty or missing folder; a name that is no name; a refusal of the middleware.
-pub fn open(mut session: Session, pieces: impl Sink<PieceImage> + Unpin + 'static) -> Result<Work, ProcessError> {
+pub fn open(
+    mut session: Session,
+    resets: impl Stream<Item = Empty> + Unpin + 'static,
+    pieces: impl Sink<PieceImage> + Unpin + 'static,
+) -> Result<Work, ProcessError> {
     let settings = session.settings();
     let calls = session.serve::<Trigger>(topics::CAPTURE_SERVICE)?;
     let folder = params::source_folder(&session.parameters);
@@ -118,7 +135,7 @@ pub fn open(mut session: Session, pieces: impl Sink<PieceImage> + Unpin + 'stati
     })?;
     Ok(Box::pin(async move {
         // The session is kept: its topics and services end with it.
-        run(frames, Requests { calls, forgets }, pieces, settings).await;
+        run(frames, Requests { calls, forgets, resets }, pieces, settings).await;
         drop(session);
         Ok(())
     }))
@@ -145,17 +162,23 @@ fn folder_frames(folder: PathBuf, settings: &Settings) -> impl Stream<Item = Fra
 
 /// What others may ask for.
 #[derive(Debug)]
-pub struct Requests<C, F> {
+pub struct Requests<C, F, R> {
     /// Calls of `capture`.
     pub calls: C,
     /// Wishes to forget the pieces seen so far.
     pub forgets: F,
+    /// The solver has forgotten them: those that are still in view are new.
+    pub resets: R,
 }
 
 /// The node's loop. Ends when frames and requests have ended.
 pub async fn run(
     frames: impl Stream<Item = Frame> + Unpin,
-    requests: Requests<impl Stream<Item = Call<Trigger>> + Unpin, impl Stream<Item = Forget> + Unpin>,
+    requests: Requests<
+        impl Stream<Item = Call<Trigger>> + Unpin,
+        impl Stream<Item = Forget> + Unpin,
+        impl Stream<Item = Empty> + Unpin,
+    >,
     mut pieces: impl Sink<PieceImage> + Unpin,
     settings: Settings,
 ) {
@@ -165,7 +188,7 @@ pub async fn run(
     let (again, more) = mpsc::unbounded();
     let mut again = Some(again);
     let mut seen = stream::select(frames, more).map(|frame| smol::unblock(move || cut_out(frame))).buffered(threads);
-    let (mut calls, mut forgets) = (requests.calls.fuse(), requests.forgets.fuse());
+    let (mut calls, mut forgets, mut resets) = (requests.calls.fuse(), requests.forgets.fuse(), requests.resets.fuse());
     let mut known = Known::default();
     let mut latest: Vec<PieceImage> = Vec::new();
     loop {
@@ -196,6 +219,10 @@ pub async fn run(
                 known = Known::default();
                 latest.clear();
                 let _ = forget.send(());
+            },
+            // What the camera shows next comes as new; a service that shows the latest frame again still can.
+            reset = resets.next() => if reset.is_some() {
+                known = Known::default();
             },
             complete => break,
         }

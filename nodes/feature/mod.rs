@@ -59,7 +59,8 @@ pub fn open_with_topics(mut session: Session) -> Result<Work, ProcessError> {
     let heard = session.subscribe_with_writer(&topics::PIECE_FEATURES)?;
     let others = session.writers_of(&topics::PIECE_FEATURES)?;
     let (work, mine) = mpsc::channel(CHANNEL_DEPTH);
-    let streams = share::Streams { pieces, heard, work, results: features.clone() };
+    let resets = session.subscribe(&topics::PIECES_RESET)?;
+    let streams = share::Streams { pieces, heard, resets, work, results: features.clone() };
     session.spawn(share::run(share::Share::new(audience.writer()), streams, others));
     open(session, mine, features)
 }

@@ -16,6 +16,7 @@ use std::time::{Duration, Instant};
 use futures::channel::mpsc;
 use futures::{SinkExt, StreamExt};
 use jigsaw_msgs::msg::{PieceFeatures, PieceImage};
+use jigsaw_msgs::std_msgs::msg::Empty;
 use rustdds::GUID;
 
 /// How long the first of the ranked nodes has for a piece before the next takes it over: hundreds of times what a piece
@@ -52,6 +53,12 @@ impl Share {
     /// Of the node whose results come from this writer.
     pub fn new(own: GUID) -> Self {
         Self { own: own.to_bytes(), waiting: HashMap::new(), results: HashMap::new(), silent: HashSet::new() }
+    }
+
+    /// All pieces are forgotten: nothing that others have found is of use any more.
+    pub fn forget(&mut self) {
+        self.waiting.clear();
+        self.results.clear();
     }
 
     /// The nodes in the order in which a piece falls to them.
@@ -133,6 +140,8 @@ pub struct Streams {
     pub pieces: mpsc::Receiver<PieceImage>,
     /// All results, and from whom.
     pub heard: mpsc::Receiver<(PieceFeatures, GUID)>,
+    /// The solver has forgotten all pieces.
+    pub resets: mpsc::Receiver<Empty>,
     /// The pieces that this node is to work on.
     pub work: mpsc::Sender<PieceImage>,
     /// Where results of nodes that have gone are published again.
@@ -141,13 +150,16 @@ pub struct Streams {
 
 /// Takes from the pieces this node's share. Ends with the pieces.
 pub async fn run(mut share: Share, streams: Streams, others: impl Fn() -> Vec<GUID>) {
-    let Streams { mut pieces, mut heard, mut work, mut results } = streams;
+    let Streams { mut pieces, mut heard, mut resets, mut work, mut results } = streams;
     let mut tick = StreamExt::fuse(smol::Timer::interval(LOOK_PERIOD));
     loop {
         let mut mine = Vec::new();
         futures::select_biased! {
             result = heard.next() => if let Some((result, by)) = result {
                 share.heard(result, by);
+            },
+            reset = resets.next() => if reset.is_some() {
+                share.forget();
             },
             piece = pieces.next() => match piece {
                 Some(piece) => mine.extend(share.offer(piece, &others(), Instant::now())),
@@ -240,6 +252,10 @@ mod tests {
         assert_eq!(kept.iter().map(Vec::len).sum::<usize>(), 100);
         assert!(kept.iter().all(|share| share.len() > 20));
         assert!(first.inherit(&[guid(1)]).is_empty());
+        // What was forgotten does not come back.
+        first.heard(result("of an earlier puzzle"), guid(2));
+        first.forget();
+        assert!(first.inherit(&[]).is_empty());
     }
 
     #[test]

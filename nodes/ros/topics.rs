@@ -8,6 +8,7 @@ use jigsaw_msgs::lifecycle_msgs::msg::TransitionEvent;
 use jigsaw_msgs::msg::{Assembly, PieceFeatures, PieceImage};
 use jigsaw_msgs::rosgraph_msgs::msg::Clock;
 use jigsaw_msgs::sensor_msgs::msg::{CompressedImage, Image};
+use jigsaw_msgs::std_msgs::msg::Empty;
 use jigsaw_msgs::tf2_msgs::msg::TFMessage;
 use jigsaw_msgs::visualization_msgs::msg::MarkerArray;
 use ros2_client::QosProfile;
@@ -62,6 +63,9 @@ pub const PIECE_IMAGE: Topic<PieceImage> = Topic::new("pieces/image", LATCHED_PI
 /// Shapes of pieces.
 pub const PIECE_FEATURES: Topic<PieceFeatures> = Topic::new("pieces/features", LATCHED_PIECES);
 
+/// The solver has forgotten all pieces: those that are in view are new.
+pub const PIECES_RESET: Topic<Empty> = Topic::new("pieces/reset", RELIABLE.history(History::KeepLast { depth: 10 }));
+
 /// Pictures of the shape analysis.
 pub const OVERLAY: Topic<Image> = Topic::new("pieces/overlay", RELIABLE.history(History::KeepLast { depth: 10 }));
 
@@ -91,7 +95,7 @@ pub const CLOCK: Topic<Clock> = Topic::new("/clock", QosProfile::subscription_de
 /// Service of the capture node: take the pieces in view (again).
 pub const CAPTURE_SERVICE: &str = "capture";
 
-/// Service of the solver node: forget all pieces.
+/// Service of the solver node: forget all pieces, and begin anew with those in view.
 pub const RESET_SERVICE: &str = "reset";
 
 /// Service of the solver node: solve now.

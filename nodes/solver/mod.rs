@@ -18,6 +18,7 @@ use jigsaw::{Assembly, Params, Piece, Solver, SolverError};
 use jigsaw_msgs::action::{Assemble, AssembleFeedback, AssembleResult};
 use jigsaw_msgs::msg::{Assembly as AssemblyMessage, PieceFeatures};
 use jigsaw_msgs::sensor_msgs::msg::Image;
+use jigsaw_msgs::std_msgs::msg::Empty;
 use jigsaw_msgs::std_srvs::srv::{Trigger, TriggerResponse};
 use jigsaw_msgs::tf2_msgs::msg::TFMessage;
 use jigsaw_msgs::visualization_msgs::msg::MarkerArray;
@@ -40,8 +41,8 @@ pub const PROGRAM: Program = Program {
     about: "Assembles jigsaw puzzles by shape.\n\n\
             Topic in:   pieces/features (jigsaw_msgs/PieceFeatures)\n\
             Topics out: assembly (jigsaw_msgs/Assembly), /tf_static, assembly/image (sensor_msgs/Image),\n            \
-            assembly/markers (visualization_msgs/MarkerArray)\n\
-            Services:   reset (std_srvs/Trigger): forget all pieces; solve (std_srvs/Trigger): solve now\n\
+            assembly/markers (visualization_msgs/MarkerArray), pieces/reset (std_msgs/Empty)\n\
+            Services:   reset (std_srvs/Trigger): begin anew with the pieces in view; solve (std_srvs/Trigger): solve now\n\
             Action:     assemble (jigsaw_msgs/action/Assemble)",
     parameters: params::PARAMETERS,
 };
@@ -58,6 +59,8 @@ pub struct Outputs {
     pub transforms: mpsc::Sender<TFMessage>,
     /// The outlines.
     pub markers: mpsc::Sender<MarkerArray>,
+    /// What the other nodes are told when all pieces are forgotten.
+    pub resets: mpsc::Sender<Empty>,
     /// What is to be drawn; [`draw`] takes it from there.
     pub solutions: mpsc::UnboundedSender<Arc<Solution>>,
     /// Where the pieces taken in are kept, if anywhere.
@@ -97,13 +100,25 @@ pub async fn draw(
     }
 }
 
-/// Opens the topics and services of the node and gives its loop, which takes the shapes from `features`.
+/// Opens the node with its own topics and gives its loop.
+///
+/// # Errors
+/// As for [`open`].
+pub fn open_with_topics(mut session: Session) -> Result<Work, ProcessError> {
+    let features = session.subscribe(&topics::PIECE_FEATURES)?;
+    let (resets, _) = session.publish(&topics::PIECES_RESET)?;
+    open(session, features, resets)
+}
+
+/// Opens the topics and services of the node and gives its loop, which takes the shapes from `features` and tells
+/// `told` when it has forgotten them.
 ///
 /// # Errors
 /// A name that is no name; a refusal of the middleware.
 pub fn open(
     mut session: Session,
     features: impl Stream<Item = PieceFeatures> + Unpin + 'static,
+    told: mpsc::Sender<Empty>,
 ) -> Result<Work, ProcessError> {
     let journal = params::journal_folder(&session.parameters)
         .map(|folder| Journal::open(&folder))
@@ -122,6 +137,7 @@ pub fn open(
         assembly: session.publish(&topics::ASSEMBLY)?.0,
         transforms: session.publish(&topics::TF_STATIC)?.0,
         markers: session.publish(&topics::ASSEMBLY_MARKERS)?.0,
+        resets: told,
         solutions: to_draw,
         journal,
     };
@@ -196,8 +212,7 @@ pub async fn run(
             done = solving => table.publish(done).await,
             call = resets.next() => if let Some(call) = call {
                 if table.activity.is_active() {
-                    table.reset();
-                    table.publish_empty().await;
+                    table.reset().await;
                     answer(call, TriggerResponse { success: true, message: "all pieces are forgotten".to_owned() });
                 } else {
                     answer(call, inactive());
@@ -212,9 +227,7 @@ pub async fn run(
                 }
             },
             forget = forgets.next() => if let Some(forget) = forget {
-                table.reset();
-                // What is latched must not speak of pieces that are forgotten.
-                table.publish_empty().await;
+                table.reset().await;
                 let _ = forget.send(());
             },
             _ = switches.next() => if !table.activity.is_active() {
@@ -545,7 +558,8 @@ impl Table {
         }
     }
 
-    fn reset(&mut self) {
+    /// Forgets all pieces, here and upstream: what is in view from now on is new.
+    async fn reset(&mut self) {
         self.generation += 1;
         self.incoming.clear();
         self.sightings.clear();
@@ -554,5 +568,8 @@ impl Table {
         self.solver = None;
         self.keep_journal(Journal::forget_all);
         self.health.figure("pieces", 0);
+        let _ = self.outputs.resets.send(Empty::default()).await;
+        // What is latched must not speak of pieces that are forgotten.
+        self.publish_empty().await;
     }
 }

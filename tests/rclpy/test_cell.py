@@ -6,12 +6,13 @@ from builtin_interfaces.msg import Time
 from jigsaw_msgs.msg import Assembly
 from PIL import Image as Picture
 from rclpy.qos import QoSDurabilityPolicy, QoSReliabilityPolicy
-from sensor_msgs.msg import Image
+from sensor_msgs.msg import CompressedImage, Image
 from std_srvs.srv import Trigger
 from visualization_msgs.msg import Marker, MarkerArray
 
 from bench import (
     AGAIN,
+    RELIABLE,
     SCALE,
     Arm,
     Camera,
@@ -21,6 +22,8 @@ from bench import (
     image_message,
 )
 from conftest import Harness
+
+PERIOD = 0.1  # seconds between two frames of a camera that runs on
 
 
 def test_from_camera_to_a_late_arm(launcher, ros, domain, generate):
@@ -174,6 +177,56 @@ def test_reset_and_solve(launcher, ros, generate):
     after = arm.complete(6)
     check_assembly(arm, again, after)
     assert sorted(piece.id for piece in after.pieces) == sorted(piece.id for piece in before.pieces)
+
+
+class LiveCamera:
+    """Shows the same table over and over, each frame with a stamp of its own, until it is shown another one."""
+
+    def __init__(self, ros, table):
+        self.ros, self.number = ros, 0
+        self.node = ros.node("live_camera")
+        self.publisher = self.node.create_publisher(CompressedImage, "image/compressed", RELIABLE)
+        self.look_at(table)
+        self.node.create_timer(PERIOD, self.show)
+
+    def look_at(self, table):
+        with Picture.open(table) as picture:
+            self.message = compressed_message(numpy.asarray(picture.convert("L")), Time())
+
+    def show(self):
+        self.number += 1
+        self.message.header.stamp = Time(sec=self.number)
+        self.publisher.publish(self.message)
+
+
+@pytest.mark.parametrize("composed", [False, True], ids=["processes", "composed"])
+def test_reset_begins_anew_with_what_the_camera_sees(launcher, ros, generate, composed):
+    if composed:
+        launcher.start("jigsaw", "cell", "--ros-args", *SCALE)
+    else:
+        launcher.cell(*SCALE)
+    six = generate(2, 3, 5, "--pieces-per-frame", "6")
+    four = generate(2, 2, 7, "--pieces-per-frame", "4")
+    camera, arm = LiveCamera(ros, six.frames[0]), Arm(ros)
+    reset = arm.node.create_client(Trigger, "reset")
+
+    def ids():
+        return {piece.id for piece in arm.assemblies[-1].pieces}
+
+    # What lies there still comes back by itself, as new.
+    arm.complete(6)
+    before = ids()
+    assert ros.call(reset, Trigger.Request()).success
+    ros.until(lambda: len(ids()) == 6 and not ids() & before, "assembly of the pieces that lie there still")
+    arm.complete(6)
+
+    # What was taken away does not.
+    before = ids()
+    camera.look_at(four.frames[0])
+    ros.until(lambda: len(ids() | set(arm.assemblies[-1].unplaced)) == 10, "assembly with the pieces of both tables")
+    assert ros.call(reset, Trigger.Request()).success
+    ros.until(lambda: len(ids()) == 4, "assembly of the second table")
+    assert not arm.complete(4).unplaced and not ids() & before
 
 
 def test_piece_twice_in_the_frame_order_or_not_gives_the_same(launcher, ros, generate):
