@@ -135,3 +135,27 @@ fn pictures() {
         score.check(&Limits { median, most, ends }, &format!("noise {noise} blur {blur}"));
     }
 }
+
+/// Blur moves a neck towards the tighter side of a jump of curvature, and noise decides how much of that can be undone: limits as above, on
+/// banks whose radius changes at the neck.
+#[test]
+fn jumps_of_curvature() {
+    for (noise, blur, median, most, ends) in [
+        (0.0, 0.0, 0.28, 0.33, 0.36),
+        (8.0, 1.5, 0.57, 0.93, 0.96),
+        (20.0, 1.5, 0.78, 1.2, 1.5),
+        (20.0, 4.0, 1.0, 1.65, 2.5),
+    ] {
+        let mut score = Score::default();
+        let mut extractor = Extractor::default();
+        for seed in 0..20 {
+            let ratio = if seed % 2 == 0 { 0.6 } else { 1.7 };
+            let piece = Piece::random(250.0, seed).with_flare(ratio);
+            let pose = pose(seed as f64 * 0.7, 1.0, 256.3, 255.6);
+            let camera = Camera { noise, blur, seed, ..Camera::default() };
+            let features = extractor.extract(&camera.cutout(&piece.outline(&pose))).unwrap();
+            score.add(&features, &piece.necks(&pose));
+        }
+        score.check(&Limits { median, most, ends }, &format!("jumps, noise {noise} blur {blur}"));
+    }
+}

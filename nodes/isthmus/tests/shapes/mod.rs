@@ -8,11 +8,14 @@ use isthmus::mask::{Aoi, Cutout};
 use nalgebra::{Similarity2, Vector2};
 use rand::{RngExt, SeedableRng, rngs::StdRng};
 
-/// A tab: a disc of radius `head` on two fillets of radius `fillet` that touch the side of the body. All in pixels.
+/// A tab: a disc of radius `head` on two banks, each an arc of radius `fillet` from the side of the body to the neck and one of radius
+/// `flare` on from there to the disc. All in pixels.
 #[derive(Debug, Clone, Copy)]
 pub struct Tab {
     pub head: f64,
     pub fillet: f64,
+    /// Where it differs from `fillet`, the banks' curvature jumps at the neck.
+    pub flare: f64,
     /// Height of the head's centre over the side.
     pub height: f64,
     /// Shift along the side, from its middle.
@@ -20,20 +23,20 @@ pub struct Tab {
 }
 
 impl Tab {
-    /// Distance of a fillet's centre from the tab's axis.
-    fn fillet_offset(self) -> f64 {
-        ((self.head + self.fillet).powi(2) - (self.height - self.fillet).powi(2)).sqrt()
+    /// Half the width of the neck.
+    fn half_neck(self) -> f64 {
+        ((self.head + self.flare).powi(2) - (self.height - self.fillet).powi(2)).sqrt() - self.flare
     }
 
     pub fn neck(self) -> f64 {
-        2.0 * (self.fillet_offset() - self.fillet)
+        2.0 * self.half_neck()
     }
 
     /// Outline from left to right over a side along x, outwards being -y; dense.
     fn outline(self) -> Vec<Vector2<f64>> {
-        let c = self.fillet_offset();
-        let (left, head) = (Vector2::new(-c, -self.fillet), Vector2::new(0.0, -self.height));
-        let joint = (head - left).y.atan2((head - left).x);
+        let centre = |radius: f64| Vector2::new(-self.half_neck() - radius, -self.fillet);
+        let (below, above, head) = (centre(self.fillet), centre(self.flare), Vector2::new(0.0, -self.height));
+        let joint = (head - above).y.atan2((head - above).x);
         let arc = |centre: Vector2<f64>, radius: f64, from: f64, to: f64| {
             let n = ((to - from).abs() * radius / STEP).ceil() as usize;
             (0..n).map(move |i| {
@@ -42,11 +45,11 @@ impl Tab {
             })
         };
         let quarter = std::f64::consts::FRAC_PI_2;
-        let mut points: Vec<_> = arc(left, self.fillet, quarter, joint).collect();
+        let bank: Vec<_> = arc(below, self.fillet, quarter, 0.0).chain(arc(above, self.flare, 0.0, joint)).collect();
         let start = joint + std::f64::consts::PI;
+        let mut points = bank.clone();
         points.extend(arc(head, self.head, start, 3.0 * std::f64::consts::PI - start));
-        let mirrored: Vec<_> = arc(left, self.fillet, quarter, joint).map(|p| Vector2::new(-p.x, p.y)).collect();
-        points.extend(mirrored.into_iter().rev());
+        points.extend(bank.iter().rev().map(|p| Vector2::new(-p.x, p.y)));
         points.iter().map(|p| p + Vector2::new(self.shift, 0.0)).collect()
     }
 
@@ -88,6 +91,7 @@ impl Piece {
         let tab = |k: f64, shift: f64| Tab {
             head: 0.115 * size * k,
             fillet: 0.035 * size,
+            flare: 0.035 * size,
             height: 0.15 * size * k,
             shift: shift * size,
         };
@@ -107,9 +111,11 @@ impl Piece {
         let mut rng = StdRng::seed_from_u64(seed);
         let sides = std::array::from_fn(|_| {
             let k = rng.random_range(0.85..1.1);
+            let fillet = rng.random_range(0.025..0.05) * size;
             let tab = Tab {
                 head: 0.115 * size * k,
-                fillet: rng.random_range(0.025..0.05) * size,
+                fillet,
+                flare: fillet,
                 height: 0.15 * size * k,
                 shift: rng.random_range(-0.06..0.06) * size,
             };
@@ -120,6 +126,14 @@ impl Piece {
             }
         });
         Self { size, sides }
+    }
+
+    /// The piece with banks that change their curvature at the neck: `ratio` is that of the radii above and below it.
+    pub fn with_flare(mut self, ratio: f64) -> Self {
+        for (_, tab) in self.sides.iter_mut().flatten() {
+            tab.flare = ratio * tab.fillet;
+        }
+        self
     }
 
     fn frames(&self) -> impl Iterator<Item = (usize, impl Fn(Vector2<f64>) -> Point + use<>)> {
