@@ -204,8 +204,10 @@ pub(crate) struct Contact {
     /// eliminated.
     pub(crate) hessian: Matrix3<f64>,
     pub(crate) gradient: Vector3<f64>,
-    /// How far apart the two borders run in this pose, in pixels.
+    /// How far apart the two borders run in this pose, in pixels, and the variance of that by how much it varies along
+    /// the joint.
     pub(crate) clearance: f64,
+    pub(crate) variance: f64,
 }
 
 /// Prior of a joint's clearance: mean and standard deviation, and the deviation of a border point, in pixels.
@@ -222,6 +224,7 @@ pub(crate) struct ClearancePrior {
 struct Equations {
     centre: Point,
     clearance: f64,
+    variance: f64,
     spread: f64,
     h: Matrix4<f64>,
     g: Vector4<f64>,
@@ -241,6 +244,7 @@ impl Equations {
             hessian: h.fixed_view::<3, 3>(0, 0).into_owned() - column * column.transpose() / h[(3, 3)],
             gradient: g.fixed_rows::<3>(0).into_owned() - column * (g[3] / h[(3, 3)]),
             clearance,
+            variance: self.variance,
         }
     }
 }
@@ -287,5 +291,19 @@ fn follow(a: &Outline, b: &Outline, b_from_a: &Isometry2<f64>, band: f64, stride
         h += j * j.transpose() * w;
         g += j * (w * r);
     }
-    Some(Equations { centre, clearance, spread, h, g })
+    let variance = variance(rows.iter().map(|r| r.0 - clearance), width);
+    Some(Equations { centre, clearance, variance, spread, h, g })
+}
+
+/// Variance of the mean of some residuals that are alike where they are near: by the means of blocks (batch means,
+/// Conway 1963). Those beyond `width` count as much as that.
+fn variance(residuals: impl ExactSizeIterator<Item = f64>, width: f64) -> f64 {
+    /// Blocks of a joint: each some ten points wide at the least, beyond which noise of the borders is independent.
+    const BLOCKS: usize = 8;
+    let size = residuals.len().div_ceil(BLOCKS);
+    let capped: Vec<f64> = residuals.map(|r| r.clamp(-width, width)).collect();
+    let means: Vec<f64> = capped.chunks(size).map(|c| c.iter().sum::<f64>() / c.len() as f64).collect();
+    let n = means.len() as f64;
+    let mean = means.iter().sum::<f64>() / n;
+    means.iter().map(|m| (m - mean).powi(2)).sum::<f64>() / (n * (n - 1.0).max(1.0))
 }

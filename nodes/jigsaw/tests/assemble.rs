@@ -68,6 +68,30 @@ fn clearance_is_measured_joint_by_joint() {
     assert!(score.is_perfect() && score.worst_clearance < CLEARANCE, "{score:?}");
 }
 
+/// Cut by one kerf, the joints of a puzzle tell each other what it is: of noisy pictures each alone is off by up to 0.2 px.
+#[test]
+fn joints_of_one_kerf_know_it_together() {
+    /// Greatest error of a joint's clearance on noisy, blurred pictures, in pixels.
+    const CLEARANCE: f64 = 0.1;
+    for (seed, kerf) in [(43, 0.0), (44, 1.5)] {
+        let options = Options {
+            rows: 3,
+            columns: 4,
+            clearance: [kerf, kerf],
+            noise: 20.0,
+            blur: 4.0,
+            vignette: 0.5,
+            seed,
+            ..Options::default()
+        };
+        let puzzle = Puzzle::generate(&options).expect("valid options");
+        let pieces = puzzle.seen().expect("a piece in each frame");
+        let assembly = jigsaw::assemble(&pieces, &Params::default()).expect("valid pieces");
+        let score = puzzle.score(&pieces, &assembly);
+        assert!(score.is_perfect() && score.worst_clearance < CLEARANCE, "{score:?}");
+    }
+}
+
 #[test]
 fn the_literal_rules_thin_out_the_table_step_by_step() {
     let params = Params { policy: Policy::Paper, backtracks: 20, ..Params::default() };

@@ -119,15 +119,11 @@ impl Assembler<'_> {
             evidence[*k] = evidence[*k].max(fitted + AGREEMENT);
         }
         let sure = |evidence: f64| 1.0 / (1.0 + (-evidence).exp());
-        for k in chosen {
+        let clearances = self.clearances(&chosen);
+        for (k, clearance) in chosen.into_iter().zip(clearances) {
             let [tab, mouth] = self.edges[k].slots;
             // The first contact of a piece confirms nothing beside itself.
             let least = (evidence[tab.piece].min(evidence[mouth.piece]) - AGREEMENT).max(0.0);
-            // All of the border where they lie says more than the segment by which they were matched.
-            let e = &self.edges[k];
-            let b_from_a = self.state.pose[e.b].inverse() * self.state.pose[e.a];
-            let contact = (!paper).then(|| self.contact_of(e.a, e.b, &b_from_a, FINE)).flatten();
-            let clearance = contact.map_or(self.joints[k].fit.clearance, |c| c.clearance);
             matings.push(Mated { joint: k, confidence: sure(least), clearance });
         }
         let confidence: Vec<f64> = evidence.iter().map(|e| sure((e - AGREEMENT).max(0.0))).collect();
@@ -142,5 +138,34 @@ impl Assembler<'_> {
             partial: self.partial,
             ..Outcome::default()
         }
+    }
+
+    /// The clearances of some joints, each in the light of the others: a joint's own is known to what the borders' noise
+    /// leaves, and as far as that explains how the joints of an assembly differ, they don't (empirical Bayes, Efron and
+    /// Morris 1973).
+    fn clearances(&self, joints: &[usize]) -> Vec<f64> {
+        let own = |k: &usize| {
+            // All of the border where the pieces lie says more than the segment by which they were matched.
+            let e = &self.edges[*k];
+            let b_from_a = self.state.pose[e.b].inverse() * self.state.pose[e.a];
+            let paper = self.params.policy == Policy::Paper;
+            let contact = (!paper).then(|| self.contact_of(e.a, e.b, &b_from_a, FINE)).flatten();
+            contact.map_or((self.joints[*k].fit.clearance, 0.0), |c| (c.clearance, c.variance))
+        };
+        let own: Vec<(f64, f64)> = joints.iter().map(own).collect();
+        let mut clearances = vec![0.0; own.len()];
+        for island in self.state.islands() {
+            let here: Vec<usize> =
+                (0..own.len()).filter(|i| self.state.island(self.edges[joints[*i]].a) == island).collect();
+            let n = here.len() as f64;
+            let mean = here.iter().map(|i| own[*i].0).sum::<f64>() / n;
+            let noise = here.iter().map(|i| own[*i].1).sum::<f64>() / n;
+            let spread = here.iter().map(|i| (own[*i].0 - mean).powi(2)).sum::<f64>() / (n - 1.0).max(1.0);
+            let share = if spread > noise { 1.0 - noise / spread } else { 0.0 };
+            for i in here {
+                clearances[i] = mean + share * (own[i].0 - mean);
+            }
+        }
+        clearances
     }
 }
