@@ -274,3 +274,33 @@ fn a_composed_cell_gives_the_same_assembly() {
     let (status, said) = cell.end();
     assert_eq!(status.code(), Some(0), "{said}");
 }
+
+#[test]
+fn a_log_level_is_that_of_one_node() {
+    let domain = domain::free();
+    // Alone in its process, a node has all lines; the level of another one is no concern of it.
+    for (given, heard) in
+        [("solver_node:=debug", true), ("lab.solver_node:=debug", true), ("capture_node:=debug", false)]
+    {
+        let args = ["--ros-args", "-r", "__ns:=/lab", "--log-level", given];
+        let node = Process::start(env!("CARGO_BIN_EXE_solver_node"), domain, &args);
+        Listener::new(domain).wait(&topics::DIAGNOSTICS, |_| true);
+        node.signal(Signal::SIGTERM);
+        let (_, said) = node.end();
+        assert_eq!(said.contains("[DEBUG]"), heard, "{given}: {said}");
+        assert!(said.contains("[INFO]"), "{given}: {said}");
+    }
+    // In a composed cell a line is that of the node whose module it comes from.
+    let options = Options { rows: 2, columns: 2, seed: 5, ..Options::default() };
+    let folder = Folder::of_puzzle("levels", &options);
+    let levels = ["--log-level", "warn", "--log-level", "feature_node:=debug", "--log-level", "capture_node:=info"];
+    let args = [&["cell", "--source", folder.path().to_str().unwrap(), "--ros-args"], &levels[..]].concat();
+    let cell = Process::start(env!("CARGO_BIN_EXE_jigsaw"), domain, &args);
+    Listener::new(domain).wait(&topics::ASSEMBLY, |assembly| assembly.pieces.len() == 4 && complete(assembly));
+    cell.signal(Signal::SIGTERM);
+    let (_, said) = cell.end();
+    let counted = |what: &str| said.lines().filter(|line| line.contains(what)).count();
+    assert_eq!(counted("isthmuses"), 4, "the feature node at debug: {said}");
+    assert_eq!((counted("pictures in"), counted("[INFO]")), (1, 1), "the capture node at info: {said}");
+    assert_eq!(counted("[DEBUG]"), 4, "{said}");
+}

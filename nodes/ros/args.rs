@@ -9,7 +9,7 @@
 //! | `-r`, `--remap [node:]from:=to` | remap a topic or service; `__ns`, `__node` (or `__name`) rename the node |
 //! | `-p`, `--param [node:]name:=value` | set a parameter; the value is YAML |
 //! | `--params-file FILE` | set the parameters of a YAML file, for the nodes its keys name (`*` and `**` as in ROS) |
-//! | `--log-level [logger:=]LEVEL` | debug, info, warn, error, fatal |
+//! | `--log-level [logger:=]LEVEL` | debug, info, warn, error, fatal; of all lines, or those of a node or namespace |
 //! | `-e`, `--enclave NAME` | security enclave |
 //! | `--[en\|dis]able-rosout-logs`, `--[en\|dis]able-stdout-logs`, `--[en\|dis]able-external-lib-logs` | logging |
 //!

@@ -1,11 +1,12 @@
 //! Log lines: to the console as ROS prints them, and to `/rosout`.
 //!
-//! The levels come from `--log-level`, or from `RUST_LOG` where that is set. Lines of the middleware's own libraries are
-//! off unless `RUST_LOG` asks for them: they report the orderly end of a node as errors.
+//! The levels come from `--log-level`, or from `RUST_LOG` where that is set. `--log-level NAME:=LEVEL` is for one logger:
+//! that of a node, of the nodes of a namespace, or of a library by its module path. Lines of the middleware's own libraries
+//! are off unless they are asked for: they report the orderly end of a node as errors.
 
 use std::collections::HashMap;
 use std::io::Write;
-use std::sync::{Mutex, OnceLock, PoisonError};
+use std::sync::{Mutex, MutexGuard, OnceLock, PoisonError};
 use std::time::{Duration, Instant};
 
 use log::{Level, LevelFilter, Log, Metadata, Record};
@@ -13,7 +14,7 @@ use ros2_client::builtin_interfaces::Time;
 use ros2_client::ros2::LogLevel;
 use ros2_client::{NodeLoggingHandle, RosoutRaw};
 
-use super::args::RosArgs;
+use super::args::{NodeNames, RosArgs};
 
 const NANOS: i64 = 1_000_000_000;
 
@@ -24,45 +25,106 @@ static LOGGER: OnceLock<Logger> = OnceLock::new();
 
 struct Logger {
     console: Option<env_logger::Logger>,
+    /// What of other crates, and of this one under `RUST_LOG`, goes to the console.
+    filter: env_filter::Filter,
+    /// The level that was asked for, of a node that no other was asked for.
     level: LevelFilter,
+    /// The levels that were asked for by name.
+    levels: Vec<(String, LevelFilter)>,
     rosout: bool,
-    nodes: Mutex<Vec<(String, NodeLoggingHandle)>>,
+    nodes: Mutex<Vec<NodeLogger>>,
+}
+
+/// The lines of a node: those of the module it is named after, or all of them where it is alone.
+struct NodeLogger {
+    module: String,
+    /// Asked for by name.
+    level: Option<LevelFilter>,
+    rosout: Option<NodeLoggingHandle>,
 }
 
 impl Log for Logger {
     fn enabled(&self, metadata: &Metadata<'_>) -> bool {
-        self.console.as_ref().is_some_and(|console| console.enabled(metadata)) || self.to_rosout(metadata)
+        if is_own(metadata) {
+            let level = asked_for(&self.nodes(), metadata);
+            self.to_console(level, metadata) || self.to_rosout(level, metadata)
+        } else {
+            self.to_console(None, metadata)
+        }
     }
 
     fn log(&self, record: &Record<'_>) {
-        if let Some(console) = &self.console {
+        // The middleware's lines, which writing to `/rosout` below may bring about, find the nodes locked.
+        let nodes = is_own(record.metadata()).then(|| self.nodes());
+        let nodes = nodes.as_ref().map_or(&[][..], |nodes| nodes.as_slice());
+        let level = asked_for(nodes, record.metadata());
+        if self.to_console(level, record.metadata())
+            && let Some(console) = &self.console
+        {
             console.log(record);
         }
-        if self.to_rosout(record.metadata()) {
-            let nodes = self.nodes.lock().unwrap_or_else(PoisonError::into_inner);
-            // A line of the module `…::capture` belongs to the node that registered as `capture_node`.
-            let node = nodes.iter().find(|(module, _)| record.target().split("::").any(|part| part == module));
-            if let Some((_, handle)) = node.or(nodes.first()) {
-                handle.rosout_raw(
-                    Time::now(),
-                    rosout_level(record.level()),
-                    handle.base_name(),
-                    &record.args().to_string(),
-                    record.file().unwrap_or_default(),
-                    "",
-                    record.line().unwrap_or_default(),
-                );
-            }
+        if self.to_rosout(level, record.metadata())
+            && let Some(handle) =
+                node_of(nodes, record.target()).or(nodes.first()).and_then(|node| node.rosout.as_ref())
+        {
+            handle.rosout_raw(
+                Time::now(),
+                rosout_level(record.level()),
+                handle.base_name(),
+                &record.args().to_string(),
+                record.file().unwrap_or_default(),
+                "",
+                record.line().unwrap_or_default(),
+            );
         }
     }
 
     fn flush(&self) {}
 }
 
-impl Logger {
-    fn to_rosout(&self, metadata: &Metadata<'_>) -> bool {
-        self.rosout && metadata.target().starts_with(OWN_TARGET) && metadata.level() <= self.level
+/// Whether a line is this crate's.
+fn is_own(metadata: &Metadata<'_>) -> bool {
+    metadata.target().starts_with(OWN_TARGET)
+}
+
+/// The node that a line belongs to.
+fn node_of<'a>(nodes: &'a [NodeLogger], target: &str) -> Option<&'a NodeLogger> {
+    match nodes {
+        [only] => Some(only),
+        _ => nodes.iter().find(|node| target.split("::").any(|part| part == node.module)),
     }
+}
+
+/// The level that was asked for by the name of the node that a line belongs to.
+fn asked_for(nodes: &[NodeLogger], metadata: &Metadata<'_>) -> Option<LevelFilter> {
+    node_of(nodes, metadata.target()).and_then(|node| node.level)
+}
+
+impl Logger {
+    fn nodes(&self) -> MutexGuard<'_, Vec<NodeLogger>> {
+        self.nodes.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    fn to_console(&self, asked_for: Option<LevelFilter>, metadata: &Metadata<'_>) -> bool {
+        self.console.is_some()
+            && asked_for.map_or_else(|| self.filter.enabled(metadata), |level| metadata.level() <= level)
+    }
+
+    fn to_rosout(&self, asked_for: Option<LevelFilter>, metadata: &Metadata<'_>) -> bool {
+        self.rosout && is_own(metadata) && metadata.level() <= asked_for.unwrap_or(self.level)
+    }
+}
+
+/// The level that was asked for by one of the names of a node's logger: as in ROS the full name, with dots, or the
+/// beginning of it; its own name without the namespace, and that of its module. The longest of them counts, and of equal
+/// ones the last.
+fn level_of(levels: &[(String, LevelFilter)], names: &NodeNames, module: &str) -> Option<LevelFilter> {
+    let full_name = names.full_name().trim_start_matches('/').replace('/', ".");
+    let names_it = |name: &str| {
+        let begins = full_name.strip_prefix(name).is_some_and(|rest| rest.is_empty() || rest.starts_with('.'));
+        begins || name == names.name() || name == module
+    };
+    levels.iter().filter(|(name, _)| names_it(name)).max_by_key(|(name, _)| name.len()).map(|(_, level)| *level)
 }
 
 fn rosout_level(level: Level) -> LogLevel {
@@ -78,45 +140,61 @@ fn rosout_level(level: Level) -> LogLevel {
 pub fn start(program: &str, args: &RosArgs) {
     let level = args.log_level.unwrap_or(LevelFilter::Info);
     let logger = LOGGER.get_or_init(|| {
-        let mut builder = env_logger::Builder::new();
+        let mut filter = env_filter::Builder::new();
         match std::env::var("RUST_LOG") {
-            Ok(filters) if args.log_level.is_none() => builder.parse_filters(&filters),
-            _ => builder.filter_level(LevelFilter::Off).filter_module(OWN_TARGET, level),
+            Ok(filters) if args.log_level.is_none() => filter.parse(&filters),
+            _ => filter.filter_level(LevelFilter::Off).filter_module(OWN_TARGET, level),
         };
         for (logger, level) in &args.logger_levels {
-            builder.filter_module(logger, *level);
+            filter.filter_module(logger, *level);
         }
+        // What is written was let through before.
+        let mut console = env_logger::Builder::new();
+        console.filter_level(LevelFilter::Trace);
         let program = program.to_owned();
-        builder.format(move |out, record| {
+        console.format(move |out, record| {
             let nanos = Time::now().to_nanos();
             let (sec, nanosec) = (nanos.div_euclid(NANOS), nanos.rem_euclid(NANOS));
             writeln!(out, "[{}] [{sec}.{nanosec:09}] [{program}]: {}", record.level(), record.args())
         });
         Logger {
-            console: args.console.then(|| builder.build()),
+            console: args.console.then(|| console.build()),
+            filter: filter.build(),
             level,
+            levels: args.logger_levels.clone(),
             rosout: args.rosout,
             nodes: Mutex::new(Vec::new()),
         }
     });
-    let most = logger.console.as_ref().map_or(LevelFilter::Off, env_logger::Logger::filter).max(level);
+    let by_name = logger.levels.iter().map(|(_, level)| *level).max().unwrap_or(LevelFilter::Off);
     if log::set_logger(logger).is_ok() {
-        log::set_max_level(most);
+        log::set_max_level(logger.filter.filter().max(level).max(by_name));
     }
 }
 
-/// Sends the log lines of a node (those of the module it is named after) to `/rosout`.
-pub fn add_node(name: &str, handle: NodeLoggingHandle) {
+/// Makes the log lines of a node (those of the module that `program` names) its own, at the level that was asked for by
+/// its name.
+pub fn add_node(program: &str, names: &NodeNames) {
     if let Some(logger) = LOGGER.get() {
-        let module = name.trim_end_matches("_node").to_owned();
-        logger.nodes.lock().unwrap_or_else(PoisonError::into_inner).push((module, handle));
+        let module = program.trim_end_matches("_node").to_owned();
+        let level = level_of(&logger.levels, names, &module);
+        logger.nodes().push(NodeLogger { module, level, rosout: None });
+    }
+}
+
+/// Sends the log lines of the node that was added last to `/rosout`.
+pub fn open_rosout(handle: NodeLoggingHandle) {
+    if let Some(logger) = LOGGER.get()
+        && let Some(node) = logger.nodes().last_mut()
+    {
+        node.rosout = Some(handle);
     }
 }
 
 /// Stops sending to `/rosout`: the nodes are about to go.
 pub fn remove_nodes() {
     if let Some(logger) = LOGGER.get() {
-        logger.nodes.lock().unwrap_or_else(PoisonError::into_inner).clear();
+        logger.nodes().iter_mut().for_each(|node| node.rosout = None);
     }
 }
 
@@ -166,6 +244,25 @@ impl Throttle {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_level_is_asked_for_by_the_names_of_a_node() {
+        let level = |asked: &[&str]| {
+            let args = asked.iter().flat_map(|asked| ["--log-level", asked]);
+            let args = RosArgs::parse(["--ros-args", "-r", "__ns:=/lab/east"].into_iter().chain(args)).unwrap();
+            level_of(&args.logger_levels, &args.node("/", "solver_node").unwrap(), "solver")
+        };
+        use LevelFilter::{Debug, Error, Warn};
+        for name in ["lab.east.solver_node", "lab.east", "lab", "solver_node", "solver"] {
+            assert_eq!(level(&[&format!("{name}:=debug")]), Some(Debug), "{name}");
+        }
+        for name in ["lab.east.solver", "la", "east", "capture_node", "solver_nod", "/lab/east"] {
+            assert_eq!(level(&[&format!("{name}:=debug")]), None, "{name}");
+        }
+        assert_eq!(level(&["lab.east:=warn", "lab:=debug"]), Some(Warn), "the longest name");
+        assert_eq!(level(&["lab:=warn", "lab:=error"]), Some(Error), "the last of equal ones");
+        assert_eq!(level(&["debug"]), None);
+    }
 
     #[test]
     fn one_line_of_a_kind_in_a_period() {

@@ -193,7 +193,7 @@ pub fn exit_code(program: &str, result: Result<(), ProcessError>) -> ExitCode {
 fn help(program: &Program) -> String {
     let mut text = format!(
         "{}\n\nUsage: {} [--ros-args [-r FROM:=TO] [-p NAME:=VALUE] [--params-file FILE]\n       \
-         [-r __ns:=/NAMESPACE] [-r __node:=NAME] [--log-level LEVEL] [--]]\n\n\
+         [-r __ns:=/NAMESPACE] [-r __node:=NAME] [--log-level [LOGGER:=]LEVEL] [--]]\n\n\
          Environment: ROS_DOMAIN_ID, ROS_LOCALHOST_ONLY, ROS_AUTOMATIC_DISCOVERY_RANGE, RUST_LOG,\n\
          ROS_SECURITY_ENABLE, ROS_SECURITY_KEYSTORE, ROS_SECURITY_STRATEGY, ROS_SECURITY_ENCLAVE_OVERRIDE\n\nParameters:\n",
         program.about, program.name
@@ -282,6 +282,7 @@ impl Process {
             given.addressed &= !self.tables.iter().flat_map(|table| table.iter()).any(|spec| spec.name == given.name);
         }
         table.start_with(&overrides)?;
+        logging::add_node(name, &names);
         let context = self.context(&table)?;
         let node_name = NodeName::new(names.namespace(), names.name())
             .map_err(|e| SessionError::middleware(format!("node {}", names.full_name()), e))?;
@@ -290,7 +291,7 @@ impl Process {
         let node = context
             .new_node(node_name, options)
             .map_err(|e| SessionError::middleware(format!("node {}", names.full_name()), e))?;
-        logging::add_node(name, node.logging_handle());
+        logging::open_rosout(node.logging_handle());
         let health = Arc::new(Health::new(&names.full_name()));
         let mut session = Session {
             context,

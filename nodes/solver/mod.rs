@@ -525,7 +525,6 @@ impl Table {
             _ => "collecting",
         };
         let summary = format!("{state}: {placed} of {seen} pieces placed, {} matings", message.matings.len());
-        log::info!("{summary}");
         self.health.state(&summary);
         self.health.figure("placed", placed);
         self.health.figure("matings", message.matings.len());
@@ -551,6 +550,9 @@ impl Table {
         }
         // A closed output is that of a process that ends.
         let _ = self.outputs.assembly.send(message).await;
+        // Off with what an arm waits for, before the rest is made.
+        smol::future::yield_now().await;
+        log::info!("{summary}");
         let _ = self.outputs.markers.send(solution.markers_message()).await;
         let _ = self.outputs.solutions.unbounded_send(Arc::new(solution));
         for call in self.waiting.drain(..) {
