@@ -20,6 +20,8 @@ const EXTENT: f32 = 4.0;
 pub(super) struct Clipping {
     /// For each whole level the mean of the clipped pixels; ascending.
     means: [f32; LEVELS],
+    /// For each whole level how many of the means are below it.
+    below: [u16; LEVELS],
     /// Means from here on...
     low: f32,
     /// ... up to here are right as they are.
@@ -42,7 +44,9 @@ impl Clipping {
             let clipped = |(d, w): (&f32, &f32)| (level as f32 + d * noise).clamp(0.0, top) * w;
             deviations.iter().zip(&weights).map(clipped).sum::<f32>() / total
         };
-        Some(Self { means: std::array::from_fn(mean), low: reach, high: top - reach })
+        let means: [f32; LEVELS] = std::array::from_fn(mean);
+        let below = std::array::from_fn(|level| means.partition_point(|m| *m < level as f32) as u16);
+        Some(Self { means, below, low: reach, high: top - reach })
     }
 
     /// The level that a mean of clipped pixels stands for: a number from 0 to 255.
@@ -50,7 +54,11 @@ impl Clipping {
         if mean >= self.low && mean <= self.high {
             return mean;
         }
-        let after = self.means.partition_point(|m| *m < mean).clamp(1, LEVELS - 1);
+        // Close above the whole level below.
+        let mut after = usize::from(self.below[mean as u8 as usize]).clamp(1, LEVELS - 1);
+        while after < LEVELS - 1 && self.means[after] < mean {
+            after += 1;
+        }
         let [below, above] = [self.means[after - 1], self.means[after]];
         let part = if above > below { (mean - below) / (above - below) } else { 0.0 };
         (after - 1) as f32 + part.clamp(0.0, 1.0)

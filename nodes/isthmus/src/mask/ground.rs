@@ -40,7 +40,7 @@ impl Blocks {
             // Each row begins elsewhere, so that narrow upright shapes are hit as well.
             let from = if columns > across { row / down % across } else { 0 };
             for column in (from..columns).step_by(across) {
-                self.samples.push(Sample { block: row * columns + column, column, row });
+                self.samples.push(Sample { block: row * columns + column, column: column as u32, row: row as u32 });
             }
         }
     }
@@ -120,63 +120,96 @@ pub(super) struct Surface {
 }
 
 impl Surface {
-    fn basis(scale: [f64; 2], column: f64, row: f64) -> Vector6<f64> {
-        let (u, v) = (column * scale[0] - 1.0, row * scale[1] - 1.0);
-        Vector6::new(1.0, u, v, u * u, u * v, v * v)
-    }
-
     /// Least squares fit to the levels of blocks (column, row, level) of a picture of so many columns and rows, repeated without what lies
-    /// far from the first fit.
+    /// far from the first fit (specks, shadows): beyond three deviations.
     pub(super) fn fit(size: [usize; 2], levels: impl Iterator<Item = ([f64; 2], f32)>) -> Self {
         let scale = size.map(|n| 2.0 / (n.max(2) - 1) as f64);
-        let samples: Vec<(Vector6<f64>, f64)> =
-            levels.map(|([column, row], level)| (Self::basis(scale, column, row), f64::from(level))).collect();
-        let level = f64::from(median(samples.iter().map(|s| s.1 as f32).collect()));
-        let mut surface = Self { coefficients: Vector6::new(level, 0.0, 0.0, 0.0, 0.0, 0.0), scale };
-        // Between the rounds, samples far from the fit (specks, shadows) are left out: those beyond three deviations.
-        let mut limit = f64::INFINITY;
-        for _ in 0..2 {
-            // The lower half of the normal equations; the factorisation looks at no more.
-            let mut normal = Matrix6::zeros();
-            let mut right = Vector6::zeros();
-            for (basis, value) in &samples {
-                if (value - surface.coefficients.dot(basis)).abs() <= limit {
-                    for j in 0..6 {
-                        for i in j..6 {
-                            normal[(i, j)] += basis[i] * basis[j];
-                        }
-                    }
-                    right += basis * *value;
-                }
-            }
-            // A tiny ridge: the ground of a tight crop may not determine all coefficients.
-            normal += Matrix6::identity() * (1e-6 * samples.len().max(1) as f64);
-            if let Some(factor) = normal.cholesky() {
-                surface.coefficients = factor.solve(&right);
-            }
-            let residuals = samples.iter().map(|(b, v)| (v - surface.coefficients.dot(b)).abs() as f32).collect();
-            limit = (3.0 / 0.6745 * f64::from(median(residuals))).max(1.0);
+        let samples: Vec<([f64; 2], f32)> = levels.collect();
+        let mut sums = NormalEquations::default();
+        for (place, level) in &samples {
+            sums.add(scaled(scale, *place), f64::from(*level), 1.0);
         }
-        surface
+        let first = Self { coefficients: sums.solve(), scale };
+        let residuals: Vec<f32> = samples.iter().map(|([x, y], level)| (level - first.at(*x, *y)).abs()).collect();
+        let limit = (3.0 / NORMAL_MAD * median(residuals.clone())).max(1.0);
+        for ((place, level), _) in samples.iter().zip(&residuals).filter(|(_, residual)| **residual > limit) {
+            sums.add(scaled(scale, *place), f64::from(*level), -1.0);
+        }
+        Self { coefficients: sums.solve(), scale }
     }
 
     /// Level at a block.
     pub(super) fn at(&self, column: f64, row: f64) -> f32 {
         let c = &self.coefficients;
-        let (u, v) = (column * self.scale[0] - 1.0, row * self.scale[1] - 1.0);
+        let [u, v] = scaled(self.scale, [column, row]);
         (c[0] + v * (c[2] + v * c[5]) + u * (c[1] + v * c[4] + u * c[3])) as f32
     }
 
-    /// Levels along a row, from a column in steps.
-    pub(super) fn fill_line(&self, row: f64, column: f64, step: f64, levels: &mut [f32]) {
+    /// The levels along a row, from a column in steps.
+    pub(super) fn along(&self, row: f64, column: f64, step: f64) -> AlongRow {
         let c = self.coefficients;
-        let v = row * self.scale[1] - 1.0;
-        let [k0, k1, k2] = [c[0] + v * (c[2] + v * c[5]), c[1] + v * c[4], c[3]].map(|k| k as f32);
-        let (first, step) = ((column * self.scale[0] - 1.0) as f32, (step * self.scale[0]) as f32);
-        for (i, level) in levels.iter_mut().enumerate() {
-            let u = first + i as i32 as f32 * step;
-            *level = k0 + u * (k1 + u * k2);
+        let [u, v] = scaled(self.scale, [column, row]);
+        let step = step * self.scale[0];
+        let slope = c[1] + v * c[4];
+        let level = c[0] + v * (c[2] + v * c[5]) + u * (slope + u * c[3]);
+        AlongRow([level, (slope + 2.0 * u * c[3]) * step, c[3] * step * step].map(|k| k as f32))
+    }
+}
+
+/// Levels along a row: a quadratic polynomial of the number of the step.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct AlongRow([f32; 3]);
+
+impl AlongRow {
+    /// Level after so many steps.
+    pub(super) fn at(&self, steps: usize) -> f32 {
+        // A row is no longer than a number of four bytes, which the processor turns into a float several at a time.
+        let i = steps as i32 as f32;
+        self.0[0] + i * (self.0[1] + i * self.0[2])
+    }
+}
+
+/// A place in the coordinates of a surface.
+fn scaled(scale: [f64; 2], [column, row]: [f64; 2]) -> [f64; 2] {
+    [column * scale[0] - 1.0, row * scale[1] - 1.0]
+}
+
+/// Sums over samples that a least squares fit of a quadratic surface needs.
+#[derive(Debug, Default)]
+struct NormalEquations {
+    count: f64,
+    /// Sums of `u^a v^b` up to the fourth degree, degree by degree, rising in `b`.
+    moments: [f64; 15],
+    /// Sums of the level times those up to the second degree.
+    right: [f64; 6],
+}
+
+impl NormalEquations {
+    /// Adds a sample (of weight 1), or takes it away again (-1).
+    fn add(&mut self, [u, v]: [f64; 2], level: f64, weight: f64) {
+        let (uu, uv, vv) = (u * u, u * v, v * v);
+        let powers =
+            [1.0, u, v, uu, uv, vv, uu * u, uu * v, u * vv, v * vv, uu * uu, uu * uv, uu * vv, uv * vv, vv * vv];
+        self.count += weight;
+        for (sum, power) in self.moments.iter_mut().zip(powers) {
+            *sum += weight * power;
         }
+        for (sum, power) in self.right.iter_mut().zip(powers) {
+            *sum += weight * level * power;
+        }
+    }
+
+    /// Coefficients of 1, u, v, u^2, uv, v^2.
+    fn solve(&self) -> Vector6<f64> {
+        const EXPONENTS: [[usize; 2]; 6] = [[0, 0], [1, 0], [0, 1], [2, 0], [1, 1], [0, 2]];
+        let normal = Matrix6::from_fn(|i, j| {
+            let [a, b] = [0, 1].map(|k| EXPONENTS[i][k] + EXPONENTS[j][k]);
+            let degree = a + b;
+            self.moments[degree * (degree + 1) / 2 + b]
+        });
+        // A tiny ridge: the ground of a tight crop may not determine all coefficients.
+        let normal = normal + Matrix6::identity() * (1e-6 * self.count.max(1.0));
+        normal.cholesky().map_or_else(Vector6::zeros, |factor| factor.solve(&Vector6::from(self.right)))
     }
 }
 
@@ -220,6 +253,8 @@ const SAMPLES: usize = 5_000;
 const FIT_SAMPLES: usize = 800;
 /// One in so many of the ground's blocks tells its scatter: a median of a thousand is known to a thirtieth.
 const SCATTER_STEP: usize = 4;
+/// Median absolute deviation of a normal distribution of standard deviation 1.
+const NORMAL_MAD: f32 = 0.674_5;
 /// Rounds of fitting the ground and asking again what belongs to it.
 const ROUNDS: usize = 3;
 /// Depths in the frame, as parts of its smaller side, at which rows and columns vote for the ground: beyond scanner edges, and
@@ -239,8 +274,9 @@ pub(super) struct Candidate {
 #[derive(Debug, Clone, Copy)]
 struct Sample {
     block: usize,
-    column: usize,
-    row: usize,
+    // Of four bytes, so that they become floating point numbers in one step.
+    column: u32,
+    row: u32,
 }
 
 /// What tells ground and shapes apart.
@@ -320,15 +356,14 @@ pub(super) fn fit(frame: &Frame<'_>, blocks: &Blocks, candidate: Candidate, resi
         ground.surfaces = blocks.planes.iter().map(|plane| fit_surface(blocks, plane, &is_ground, None)).collect();
         let residual_of = |s: &Sample| {
             let channels = blocks.planes.iter().zip(&ground.surfaces);
-            let (column, row) = (s.column as f64, s.row as f64);
+            let (column, row) = (f64::from(s.column), f64::from(s.row));
             channels.map(|(plane, surface)| (plane[s.block] - surface.at(column, row)).abs()).fold(0.0, f32::max)
         };
         residuals.clear();
         residuals.extend(blocks.samples.iter().map(residual_of));
         let of_ground = residuals.iter().zip(&is_ground).filter(|(_, g)| **g);
         let scatter: Vec<f32> = of_ground.step_by(SCATTER_STEP).map(|(r, _)| *r).collect();
-        // The median of absolute residuals is 0.67 standard deviations.
-        let sigma = median(scatter) / 0.6745;
+        let sigma = median(scatter) / NORMAL_MAD;
         let split = otsu(&residuals);
         let standing_out = split.mean_above;
         ground.scatter = sigma;
@@ -345,15 +380,14 @@ pub(super) fn fit(frame: &Frame<'_>, blocks: &Blocks, candidate: Candidate, resi
             break;
         }
     }
-    let mut levels = vec![0.0; blocks.columns];
     ground.residual = residual;
     ground.residual.resize(blocks.columns * blocks.rows, 0.0);
     for (channel, (plane, surface)) in blocks.planes.iter().zip(&ground.surfaces).enumerate() {
         let rows = plane.chunks_exact(blocks.columns).zip(ground.residual.chunks_exact_mut(blocks.columns));
         for (row, (values, residuals)) in rows.enumerate() {
-            surface.fill_line(row as f64, 0.0, 1.0, &mut levels);
-            for ((residual, value), level) in residuals.iter_mut().zip(values).zip(&levels) {
-                let difference = (value - level).abs();
+            let levels = surface.along(row as f64, 0.0, 1.0);
+            for (column, (residual, value)) in residuals.iter_mut().zip(values).enumerate() {
+                let difference = (value - levels.at(column)).abs();
                 *residual = if channel == 0 { difference } else { residual.max(difference) };
             }
         }
@@ -381,8 +415,8 @@ fn noise(frame: &Frame<'_>, blocks: &Blocks, is_ground: &[bool]) -> f32 {
     let chosen = blocks.samples.iter().zip(is_ground).filter(|(_, is_ground)| **is_ground).map(|(s, _)| s);
     let chosen = chosen.step_by(SCATTER_STEP);
     let difference = |s: &Sample| {
-        let row = frame.row((s.row * blocks.size).min(frame.height - 1));
-        let at = s.column * blocks.size * channels;
+        let row = frame.row((s.row as usize * blocks.size).min(frame.height - 1));
+        let at = s.column as usize * blocks.size * channels;
         let next = row.get(at + channels).unwrap_or(&row[at]);
         f32::from(row[at].abs_diff(*next))
     };
@@ -395,7 +429,7 @@ fn fit_surface(blocks: &Blocks, plane: &[f32], is_ground: &[bool], clipping: Opt
     let stride = (total / FIT_SAMPLES).max(1);
     let chosen = blocks.samples.iter().zip(is_ground).filter(|(_, is_ground)| **is_ground).step_by(stride);
     let level = |level| clipping.map_or(level, |clipping| clipping.level(level));
-    let samples = chosen.map(|(s, _)| ([s.column as f64, s.row as f64], level(plane[s.block])));
+    let samples = chosen.map(|(s, _)| ([f64::from(s.column), f64::from(s.row)], level(plane[s.block])));
     Surface::fit([blocks.columns, blocks.rows], samples)
 }
 

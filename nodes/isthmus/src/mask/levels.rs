@@ -2,6 +2,7 @@
 
 use super::frame::Frame;
 use super::ground::{Ground, Surface, median, quantile};
+use super::runs::Component;
 use super::standing::{MAX_DEPTH, Standing};
 
 /// Most spread of the shape's level (between its quartiles, noise aside), as a part of the contrast, at which the pixels are cut out
@@ -60,131 +61,216 @@ pub(super) struct Levels {
     one_sided: bool,
     /// Ground level (grey frames only).
     pub(super) ground: f32,
+    /// By how much it differs over the component.
+    ground_span: f32,
+}
+
+/// A block: column and row.
+type Block = (usize, usize);
+
+/// A component, block by block.
+struct Region<'a> {
+    standing: &'a Standing<'a>,
+    k: usize,
+    bounds: Component,
+}
+
+impl Region<'_> {
+    fn is_grey(&self) -> bool {
+        self.standing.blocks.planes.len() == 1
+    }
+
+    /// Level of the ground at a block, in the first channel.
+    fn ground(&self, (column, row): Block) -> f32 {
+        self.standing.ground.surfaces.first().map_or(0.0, |s| s.at(column as f64, row as f64))
+    }
+
+    fn contrast(&self, (column, row): Block) -> f32 {
+        self.standing.ground.contrast(self.standing.blocks, column, row)
+    }
+
+    fn contrasts(&self, blocks: &[Block]) -> Vec<f32> {
+        blocks.iter().map(|block| self.contrast(*block)).collect()
+    }
+
+    fn is_brighter(&self, (column, row): Block) -> bool {
+        let blocks = self.standing.blocks;
+        blocks.planes[0][row * blocks.columns + column] > self.ground((column, row))
+    }
+
+    /// The blocks of the bounding box, row by row.
+    fn blocks(&self) -> impl Iterator<Item = Block> + use<> {
+        let c = self.bounds;
+        (c.top..c.bottom).flat_map(move |row| (c.left..c.right).map(move |column| (column, row)))
+    }
+
+    /// Blocks from which all directions lead through the component for a while, or out of the frame: of so many evenly spread, about.
+    fn inner(&self, samples: usize) -> Vec<Block> {
+        let Standing { blocks, components, .. } = *self.standing;
+        let c = self.bounds;
+        let reach = ((LEVEL_DEPTH * (c.area as f64).sqrt()) as usize).clamp(1, MAX_LEVEL_DEPTH / blocks.size);
+        let step = (((c.area / samples) as f64).sqrt() as usize).max(1);
+        // The box, wider by the reach on either side; beyond the frame it is as along the frame's edge.
+        let width = c.right - c.left + 2 * reach;
+        let within = c.left.saturating_sub(reach)..blocks.columns.min(c.right + reach);
+        let [before, after] = [within.start + reach - c.left, c.right + reach - within.end];
+        let mut own = Vec::with_capacity(width * (c.bottom - c.top));
+        for row in c.top..c.bottom {
+            own.extend(std::iter::repeat_n(self.standing.is_of(self.k, within.start, row), before));
+            own.extend(self.standing.are_of(self.k, within.clone(), row));
+            own.extend(std::iter::repeat_n(self.standing.is_of(self.k, within.end - 1, row), after));
+        }
+        let own_in = |row: usize| own.chunks_exact(width).nth(row.wrapping_sub(c.top));
+        let mut inner = Vec::with_capacity(c.area / (step * step) + 1);
+        let mut both = vec![false; width];
+        for run in components.runs_of(self.k).filter(|run| (run.row - c.top).is_multiple_of(step)) {
+            let rows = [run.row.saturating_sub(reach), (run.row + reach).min(blocks.rows - 1)];
+            let [Some(above), Some(below)] = rows.map(own_in) else { continue };
+            for (both, (above, below)) in both.iter_mut().zip(above.iter().zip(below)) {
+                *both = above & below;
+            }
+            let from = if run.start == 0 { 0 } else { run.start + reach };
+            let to = if run.end == blocks.columns { run.end } else { run.end.saturating_sub(reach) };
+            let is_inner = |column: &usize| {
+                let x = column - c.left;
+                both[x] && both[x + reach] && both[x + 2 * reach]
+            };
+            inner.extend((from..to).step_by(step).filter(is_inner).map(|column| (column, run.row)));
+        }
+        inner
+    }
+
+    /// The depth from which on blocks have the shape's own level, the blur of its edge being left behind: the first whose median
+    /// residual is nearly that of the next; `depths` are those of the box's blocks.
+    fn settled_depth(&self, depths: &[u8]) -> u8 {
+        let Standing { blocks, ground, .. } = *self.standing;
+        let mut by_depth: [Vec<f32>; MAX_DEPTH as usize + 1] = Default::default();
+        for ((column, row), depth) in self.blocks().zip(depths).filter(|(_, depth)| **depth > 0) {
+            by_depth[usize::from(*depth)].push(ground.residual[row * blocks.columns + column]);
+        }
+        let counts = by_depth.each_ref().map(Vec::len);
+        let most = counts.iter().max().copied().unwrap_or(0);
+        let medians = by_depth.map(median);
+        // Few blocks are no measure, and too few to learn local levels from.
+        let enough = |depth: u8| counts[usize::from(depth)] * 4 >= most;
+        let deepest = (1..=MAX_DEPTH).rev().find(|d| enough(*d)).unwrap_or(1);
+        let settled = |d: &u8| medians[usize::from(*d)] >= SETTLED * medians[usize::from(*d) + 1];
+        (INNER_DEPTH.min(deepest)..deepest).find(settled).unwrap_or(deepest)
+    }
 }
 
 impl Levels {
     /// Levels of a component and of the ground round it.
     pub(super) fn of(standing: &Standing<'_>, k: usize) -> Self {
-        let Standing { blocks, ground, components, .. } = *standing;
-        let c = components.list[k];
-        let columns = blocks.columns;
-        let surface = |column: usize, row: usize| -> f32 {
-            ground.surfaces.first().map_or(0.0, |s| s.at(column as f64, row as f64))
-        };
-        let middle_block = ((c.left + c.right) / 2, (c.top + c.bottom) / 2);
-        let corners = [(c.left, c.top), (c.right, c.top), (c.left, c.bottom), (c.right, c.bottom), middle_block]
-            .map(|(column, row)| surface(column, row));
-        let (low, high) = corners.iter().fold((f32::MAX, f32::MIN), |(l, h), v| (l.min(*v), h.max(*v)));
-        let grey = blocks.planes.len() == 1;
-        let mut levels = Self {
+        let region = Region { standing, k, bounds: standing.components.list[k] };
+        let mut levels = Self::of_ground(&region);
+        if !levels.take_body(&region) {
+            levels.take_depths(&region);
+        }
+        levels
+    }
+
+    /// Level of the ground round a component; those of the component are not known yet.
+    fn of_ground(region: &Region<'_>) -> Self {
+        let c = region.bounds;
+        let middle = ((c.left + c.right) / 2, (c.top + c.bottom) / 2);
+        let places = [(c.left, c.top), (c.right, c.top), (c.left, c.bottom), (c.right, c.bottom), middle];
+        let levels = places.map(|block| region.ground(block));
+        let (low, high) = levels.iter().fold((f32::MAX, f32::MIN), |(l, h), v| (l.min(*v), h.max(*v)));
+        Self {
             left: c.left,
             top: c.top,
             width: c.right - c.left,
             height: c.bottom - c.top,
-            ground: corners.iter().sum::<f32>() / corners.len() as f32,
+            ground: levels.iter().sum::<f32>() / levels.len() as f32,
+            ground_span: high - low,
             ..Self::default()
-        };
-        let contrast_of = |(column, row): (usize, usize)| ground.contrast(blocks, column, row);
-        // Blocks from which all directions lead through the component for a while, or out of the frame.
-        let reach = ((LEVEL_DEPTH * (c.area as f64).sqrt()) as usize).clamp(1, MAX_LEVEL_DEPTH / blocks.size);
-        let inner_blocks = |samples: usize| {
-            let step = (((c.area / samples) as f64).sqrt() as usize).max(1);
-            let mut inner: Vec<(usize, usize)> = Vec::with_capacity(c.area / (step * step) + 1);
-            for run in components.runs_of(k).filter(|run| (run.row - c.top) % step == 0) {
-                let from = if run.start == 0 { 0 } else { run.start + reach };
-                let to = if run.end == columns { columns } else { run.end.saturating_sub(reach) };
-                let rows = [run.row.saturating_sub(reach), (run.row + reach).min(blocks.rows - 1)];
-                inner.extend((from..to).step_by(step).map(|column| (column, run.row)).filter(|(column, _)| {
-                    let across = [column.saturating_sub(reach), *column, (column + reach).min(columns - 1)];
-                    rows.iter().all(|row| across.iter().all(|column| standing.is_of(k, *column, *row)))
-                }));
-            }
-            inner
-        };
-        let mut inner = inner_blocks(LEVEL_SAMPLES);
-        let mut list: Vec<f32> = inner.iter().map(|block| contrast_of(*block)).collect();
-        let is_brighter =
-            |(column, row): &(usize, usize)| blocks.planes[0][row * columns + column] > surface(*column, *row);
-        levels.take_sense(inner.iter().filter(|block| grey && is_brighter(block)).count(), inner.len(), grey);
-        levels.contrast = quantile(&mut list, 0.5);
-        let is_ground_even = |contrast| high - low <= UNIFORM_GROUND * contrast && (levels.one_sided || !grey);
-        if !list.is_empty() {
-            if is_ground_even(levels.contrast) && is_uniform(&mut list, levels.contrast, ground.scatter) {
-                return levels;
-            }
-            if ground.scatter > MAP_NOISE * levels.contrast {
-                inner = inner_blocks(NOISY_SAMPLES);
-            }
-            if let Some(light) = levels.smooth(&inner, &mut list, ground.scatter, contrast_of) {
-                levels.course = Course::Smooth(light);
-                return levels;
-            }
         }
-        // The edge's blur reaches some blocks deep: the shape's own level is found beyond it.
-        let depths = standing.depths(k);
-        let settled = settled_depth(&depths, |i| {
-            ground.residual[(c.top + i / levels.width) * columns + c.left + i % levels.width]
-        });
-        let blocks_in = || (c.top..c.bottom).flat_map(|row| (c.left..c.right).map(move |column| (column, row)));
-        let is_deep = |depth: u8| depth >= settled;
-        inner.clear();
-        inner.extend(blocks_in().zip(&depths).filter(|(_, depth)| is_deep(**depth)).map(|(block, _)| block));
-        list.clear();
-        list.extend(inner.iter().map(|block| contrast_of(*block)));
-        if settled < INNER_DEPTH {
-            // Thinner than three blocks: the strongest blocks are the best there is.
-            levels.contrast = quantile(&mut list, 0.9);
-            let is_uniform = is_ground_even(levels.contrast);
-            levels.course = if is_uniform { Course::Uniform } else { Course::Map(vec![levels.contrast; depths.len()]) };
-            return levels;
-        }
-        levels.contrast = quantile(&mut list, 0.5);
-        if is_ground_even(levels.contrast) && is_uniform(&mut list, levels.contrast, ground.scatter) {
-            return levels;
-        }
-        levels.course = if let Some(light) = levels.smooth(&inner, &mut list, ground.scatter, contrast_of) {
-            Course::Smooth(light)
-        } else {
-            let map = blocks_in().zip(&depths).map(|(b, depth)| if is_deep(*depth) { contrast_of(b) } else { 0.0 });
-            let noise = ground.scatter / levels.contrast.max(f32::MIN_POSITIVE);
-            let reach = usize::from(settled) + BORDER_BLOCKS;
-            Course::Map(levels.spread_out(map.collect(), 2.0 * ground.threshold, reach, noise))
-        };
-        levels
     }
 
-    /// The contrast of blocks as a smooth surface over the component, if it is one; `list` is memory to be used.
-    fn smooth(
-        &self,
-        inner: &[(usize, usize)],
-        list: &mut Vec<f32>,
-        scatter: f32,
-        contrast_of: impl Fn((usize, usize)) -> f32,
-    ) -> Option<Surface> {
-        let local = |(column, row): (usize, usize)| [(column - self.left) as f64, (row - self.top) as f64];
-        let chosen = || inner.iter().step_by((inner.len() / NOISY_SAMPLES).max(1));
-        let light = Surface::fit([self.width, self.height], chosen().map(|b| (local(*b), contrast_of(*b))));
-        list.clear();
-        list.extend(chosen().map(|block| {
-            let [column, row] = local(*block);
-            contrast_of(*block) - light.at(column, row)
-        }));
+    /// Takes sense and contrast from the body of a component; whether that has one contrast, or one that runs smoothly.
+    fn take_body(&mut self, region: &Region<'_>) -> bool {
+        let scatter = region.standing.ground.scatter;
+        let mut inner = region.inner(LEVEL_SAMPLES);
+        self.take_sense(region, &inner);
+        let mut contrasts = region.contrasts(&inner);
+        self.contrast = quantile(&mut contrasts, 0.5);
+        if inner.is_empty() {
+            return false;
+        }
+        if self.is_ground_even(region) && is_uniform(&mut contrasts, self.contrast, scatter) {
+            return true;
+        }
+        if scatter > MAP_NOISE * self.contrast {
+            inner = region.inner(NOISY_SAMPLES);
+        }
+        self.take_smooth(region, &inner)
+    }
+
+    /// Takes the contrast of a component that has no even body (thin, or printed on) from its blocks beyond the blur of its edge.
+    fn take_depths(&mut self, region: &Region<'_>) {
+        let scatter = region.standing.ground.scatter;
+        let depths = region.standing.depths(region.k);
+        let settled = region.settled_depth(&depths);
+        let is_deep = |depth: u8| depth >= settled;
+        let deep: Vec<Block> =
+            region.blocks().zip(&depths).filter(|(_, depth)| is_deep(**depth)).map(|(block, _)| block).collect();
+        let mut contrasts = region.contrasts(&deep);
+        if settled < INNER_DEPTH {
+            // Thinner than three blocks: the strongest blocks are the best there is.
+            self.contrast = quantile(&mut contrasts, 0.9);
+            if !self.is_ground_even(region) {
+                self.course = Course::Map(vec![self.contrast; depths.len()]);
+            }
+            return;
+        }
+        self.contrast = quantile(&mut contrasts, 0.5);
+        let is_even = self.is_ground_even(region) && is_uniform(&mut contrasts, self.contrast, scatter);
+        if is_even || self.take_smooth(region, &deep) {
+            return;
+        }
+        let contrast_of = |(block, depth): (Block, &u8)| if is_deep(*depth) { region.contrast(block) } else { 0.0 };
+        let map = region.blocks().zip(&depths).map(contrast_of).collect();
+        let noise = scatter / self.contrast.max(f32::MIN_POSITIVE);
+        let reach = usize::from(settled) + BORDER_BLOCKS;
+        self.course = Course::Map(self.spread_out(map, 2.0 * region.standing.ground.threshold, reach, noise));
+    }
+
+    /// Takes the contrast of blocks for a smooth surface over the component, if it is one.
+    fn take_smooth(&mut self, region: &Region<'_>, inner: &[Block]) -> bool {
+        let local = |(column, row): Block| [(column - self.left) as f64, (row - self.top) as f64];
+        let chosen = inner.iter().step_by((inner.len() / NOISY_SAMPLES).max(1));
+        let samples: Vec<([f64; 2], f32)> = chosen.map(|block| (local(*block), region.contrast(*block))).collect();
+        let light = Surface::fit([self.width, self.height], samples.iter().copied());
         let [right, bottom] = [self.width, self.height].map(|side| (side - 1) as f64);
         let corners = [(0.0, 0.0), (right, 0.0), (0.0, bottom), (right, bottom)];
         let is_light = corners.iter().all(|(x, y)| light.at(*x, *y) >= LEAST_LIGHT * self.contrast);
-        (is_light && is_uniform(list, self.contrast, scatter)).then_some(light)
+        let mut residuals: Vec<f32> = samples.iter().map(|([x, y], contrast)| contrast - light.at(*x, *y)).collect();
+        let is_smooth = is_light && is_uniform(&mut residuals, self.contrast, region.standing.ground.scatter);
+        if is_smooth {
+            self.course = Course::Smooth(light);
+        }
+        is_smooth
+    }
+
+    /// Whether one level will do for the ground, and one sense for the shape.
+    fn is_ground_even(&self, region: &Region<'_>) -> bool {
+        self.ground_span <= UNIFORM_GROUND * self.contrast && (self.one_sided || !region.is_grey())
+    }
+
+    /// Whether the shape is brighter or darker than the ground, by blocks within it.
+    fn take_sense(&mut self, region: &Region<'_>, inner: &[Block]) {
+        let is_grey = region.is_grey();
+        let all = inner.len();
+        let brighter = inner.iter().filter(|block| is_grey && region.is_brighter(**block)).count();
+        self.sense = if 2 * brighter >= all { 1.0 } else { -1.0 };
+        // A twentieth of the blocks may be specks or print.
+        self.one_sided = is_grey && all > 0 && brighter.min(all - brighter) * 20 <= all;
     }
 
     /// Whether one pair of levels will do.
     pub(super) fn is_uniform(&self) -> bool {
         matches!(self.course, Course::Uniform)
-    }
-
-    /// Whether the shape is brighter or darker than the ground, from the number of blocks that are brighter.
-    fn take_sense(&mut self, brighter: usize, all: usize, grey: bool) {
-        self.sense = if 2 * brighter >= all { 1.0 } else { -1.0 };
-        // A twentieth of the blocks may be specks or print.
-        self.one_sided = grey && all > 0 && brighter.min(all - brighter) * 20 <= all;
     }
 
     /// Spreads the levels of the inner blocks out over the box, each block taking the mean of its neighbours that have a level;
@@ -225,23 +311,19 @@ impl Levels {
 
     /// Fills `line` with the reciprocal contrast of the pixels of row `y` from column `from` on, between the blocks' centres.
     fn fill_reciprocals(&self, block: usize, (y, from): (usize, usize), line: &mut [f32]) {
-        // Block k has its centre at pixel k * block + (block - 1) / 2.
-        let in_blocks = |pixel: usize| (pixel as f32 - (block - 1) as f32 / 2.0) / block as f32;
         let map = match &self.course {
             Course::Uniform => {
                 line.fill(1.0 / self.contrast.max(f32::MIN_POSITIVE));
                 return;
             }
             Course::Smooth(light) => {
-                let (column, row) = (in_blocks(from) - self.left as f32, in_blocks(y) - self.top as f32);
-                light.fill_line(f64::from(row), f64::from(column), 1.0 / block as f64, line);
-                let least = LEAST_LIGHT * self.contrast;
-                line.iter_mut().for_each(|contrast| *contrast = 1.0 / contrast.max(least));
+                let light = self.light_along(light, block, (y, from));
+                line.iter_mut().enumerate().for_each(|(i, reciprocal)| *reciprocal = 1.0 / light(i));
                 return;
             }
             Course::Map(map) => map,
         };
-        let row = (in_blocks(y) - self.top as f32).clamp(0.0, (self.height - 1) as f32);
+        let row = (in_blocks(y, block) as f32 - self.top as f32).clamp(0.0, (self.height - 1) as f32);
         let (j, t) = (row as usize, row.fract());
         let upper = &map[j * self.width..][..self.width];
         let lower = &map[(j + 1).min(self.height - 1) * self.width..][..self.width];
@@ -250,7 +332,7 @@ impl Levels {
         let mut i = usize::MAX;
         let (mut left, mut right) = (0.0, 0.0);
         for (x, value) in line.iter_mut().enumerate() {
-            let column = (in_blocks(from + x) - self.left as f32).clamp(0.0, (self.width - 1) as f32);
+            let column = (in_blocks(from + x, block) as f32 - self.left as f32).clamp(0.0, (self.width - 1) as f32);
             let at = column as usize;
             if at != i {
                 (left, right) = (reciprocal(at), reciprocal((at + 1).min(self.width - 1)));
@@ -260,47 +342,66 @@ impl Levels {
         }
     }
 
+    /// A smooth contrast by the number of the pixel, along row `y` from column `from` on.
+    fn light_along(&self, light: &Surface, block: usize, (y, from): (usize, usize)) -> impl Fn(usize) -> f32 + use<> {
+        let (row, column) = (in_blocks(y, block) - self.top as f64, in_blocks(from, block) - self.left as f64);
+        let light = light.along(row, column, 1.0 / block as f64);
+        let least = LEAST_LIGHT * self.contrast;
+        move |i| light.at(i).max(least)
+    }
+
     /// Fills a row of pixels with their difference from the ground, divided by the local contrast unless that is uniform.
     pub(super) fn fill_row(
         &self,
         rows: &mut RowSource<'_>,
         (y, from): (usize, usize),
         out: &mut [u8],
-        levels: [f32; 2],
+        [shape_level, ground_level]: [f32; 2],
     ) {
-        /// Floating point numbers of this size have no fraction.
-        const WHOLE: f32 = 8_388_608.0;
-        let (frame, ground, block) = (rows.frame, rows.ground, rows.block);
-        let in_blocks = |pixel: usize| (pixel as f64 - (block - 1) as f64 / 2.0) / block as f64;
+        let (frame, block) = (rows.frame, rows.block);
         let channels = frame.format.channels();
         let source = &frame.row(y)[from * channels..];
-        let [difference, line] = &mut rows.lines;
-        for line in [&mut *difference, &mut *line] {
+        let (row, column, step) = (in_blocks(y, block), in_blocks(from, block), 1.0 / block as f64);
+        let range = shape_level - ground_level;
+        if let (true, Course::Smooth(light), [ground]) = (self.one_sided, &self.course, &rows.ground.surfaces[..]) {
+            // Neighbouring pixels go through the processor together, all the way.
+            let (ground, light) = (ground.along(row, column, step), self.light_along(light, block, (y, from)));
+            let range = self.sense * range;
+            for (i, (out, p)) in out.iter_mut().zip(source).enumerate() {
+                *out = rounded(ground_level + range * (f32::from(*p) - ground.at(i)) / light(i));
+            }
+            return;
+        }
+        let [difference, reciprocals] = &mut rows.lines;
+        for line in [&mut *difference, &mut *reciprocals] {
             line.clear();
             line.resize(out.len(), 0.0);
         }
-        for (c, surface) in ground.surfaces.iter().enumerate() {
-            surface.fill_line(in_blocks(y), in_blocks(from), 1.0 / block as f64, line);
-            let places = difference.iter_mut().zip(&*line);
-            if self.one_sided {
-                // One channel: neighbouring pixels go through the processor together.
-                for ((d, g), p) in places.zip(source) {
-                    *d = self.sense * (f32::from(*p) - g);
-                }
-            } else {
-                for ((d, g), p) in places.zip(source.iter().skip(c).step_by(channels)) {
-                    *d = d.max((f32::from(*p) - g).abs());
-                }
+        for (c, ground) in rows.ground.surfaces.iter().enumerate() {
+            let ground = ground.along(row, column, step);
+            for (i, (d, p)) in difference.iter_mut().zip(source.iter().skip(c).step_by(channels)).enumerate() {
+                let signed = f32::from(*p) - ground.at(i);
+                *d = if self.one_sided { self.sense * signed } else { d.max(signed.abs()) };
             }
         }
-        let [shape_level, ground_level] = levels;
-        self.fill_reciprocals(block, (y, from), line);
-        for ((out, d), reciprocal) in out.iter_mut().zip(&*difference).zip(&*line) {
-            let level = ground_level + (shape_level - ground_level) * d * reciprocal;
-            // Added to 2^23, a number from 0 to 255 is rounded, and its whole part is the lowest byte.
-            *out = (level.clamp(0.0, 255.0) + WHOLE).to_bits() as u8;
+        self.fill_reciprocals(block, (y, from), reciprocals);
+        for ((out, d), reciprocal) in out.iter_mut().zip(&*difference).zip(&*reciprocals) {
+            *out = rounded(ground_level + range * d * reciprocal);
         }
     }
+}
+
+/// A place in blocks, from one in pixels: block k has its centre at pixel `k * block + (block - 1) / 2`.
+fn in_blocks(pixel: usize, block: usize) -> f64 {
+    (pixel as f64 - (block - 1) as f64 / 2.0) / block as f64
+}
+
+/// A level of the 8-bit scale.
+fn rounded(level: f32) -> u8 {
+    /// Floating point numbers of this size have no fraction: added to it, a number from 0 to 255 is rounded, and its whole part is the lowest
+    /// byte.
+    const WHOLE: f32 = 8_388_608.0;
+    (level.clamp(0.0, 255.0) + WHOLE).to_bits() as u8
 }
 
 /// Where the pixels of a row come from.
@@ -319,21 +420,4 @@ fn is_uniform(levels: &mut [f32], contrast: f32, scatter: f32) -> bool {
     let spread = quantile(levels, 0.75) - quantile(levels, 0.25);
     let excess = (spread.powi(2) - (QUARTILES * scatter).powi(2)).max(0.0).sqrt();
     excess <= UNIFORM * contrast
-}
-
-/// The depth from which on blocks of a shape have its own level, the blur of its edge being left behind: the first whose median
-/// residual is nearly that of the next.
-fn settled_depth(depths: &[u8], residual: impl Fn(usize) -> f32) -> u8 {
-    let mut by_depth: [Vec<f32>; MAX_DEPTH as usize + 1] = Default::default();
-    for (i, depth) in depths.iter().enumerate().filter(|(_, depth)| **depth > 0) {
-        by_depth[usize::from(*depth)].push(residual(i));
-    }
-    let counts = by_depth.each_ref().map(Vec::len);
-    let most = counts.iter().max().copied().unwrap_or(0);
-    let medians = by_depth.map(median);
-    // Few blocks are no measure, and too few to learn local levels from.
-    let enough = |depth: u8| counts[usize::from(depth)] * 4 >= most;
-    let deepest = (1..=MAX_DEPTH).rev().find(|d| enough(*d)).unwrap_or(1);
-    let settled = |d: &u8| medians[usize::from(*d)] >= SETTLED * medians[usize::from(*d) + 1];
-    (INNER_DEPTH.min(deepest)..deepest).find(settled).unwrap_or(deepest)
 }

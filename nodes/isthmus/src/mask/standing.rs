@@ -2,6 +2,7 @@
 
 use super::ground::{Blocks, Ground};
 use super::runs::Components;
+use std::ops::Range;
 
 /// Owner of the blocks that belong to no component.
 pub(super) const NOBODY: u32 = u32::MAX;
@@ -41,8 +42,15 @@ pub(super) struct Standing<'a> {
 impl Standing<'_> {
     /// Whether a block belongs to a component itself, rather than to its surroundings.
     pub(super) fn is_of(&self, k: usize, column: usize, row: usize) -> bool {
-        let block = row * self.blocks.columns + column;
-        self.owner[block] == k as u32 && self.ground.residual[block] > self.ground.threshold
+        self.are_of(k, column..column + 1, row).all(|is_of| is_of)
+    }
+
+    /// The same for neighbouring blocks of a row.
+    pub(super) fn are_of(&self, k: usize, columns: Range<usize>, row: usize) -> impl Iterator<Item = bool> {
+        let (begin, threshold) = (row * self.blocks.columns, self.ground.threshold);
+        let blocks = begin + columns.start..begin + columns.end;
+        let owners = self.owner[blocks.clone()].iter();
+        owners.zip(&self.ground.residual[blocks]).map(move |(owner, r)| (*owner == k as u32) & (*r > threshold))
     }
 
     /// How many blocks deep within a component each block of its box lies (1 along its border, 0 outside of it), up to
