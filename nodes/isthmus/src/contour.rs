@@ -425,7 +425,7 @@ impl Tracer {
             self.band.mark(contour, [second.width, second.height]);
             let sigma = (late * late - second.variance()).sqrt() / second.step;
             let is_shape = |value: f32| sense * (value - level) > 0.0;
-            self.band.blur(second.pixels, sigma, cutout.ground_level, is_shape, &mut self.starts);
+            self.band.blur(second, sigma, cutout.ground_level, is_shape, &mut self.starts);
             let picture = Blurred { band: &self.band, raw: second };
             if !self.contours.trace(&Raster { picture, level, contrast, sense }, &self.starts) {
                 return None;

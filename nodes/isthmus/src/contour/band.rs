@@ -6,10 +6,12 @@
 use super::iso::{Picture, Start};
 use crate::Point;
 use crate::changes::changes;
+use std::ops::Range;
 
-/// The pixels as they are.
+/// The pixels as they are, of the full picture or of one of less resolution.
 #[derive(Clone, Copy)]
 pub(super) struct Raw<'a> {
+    /// Row by row, `width * height` of them; at least one.
     pub(super) pixels: &'a [u8],
     pub(super) width: usize,
     pub(super) height: usize,
@@ -39,10 +41,11 @@ impl Raw<'_> {
         upper + (lower - upper) * v
     }
 
-    /// Where rows go over from ground to shape.
+    /// Where rows go over from ground to shape, beyond `level`; `sense` is 1 for a shape brighter than the ground, -1 for a darker one.
     pub(super) fn starts(&self, level: f32, sense: f32, starts: &mut Vec<Start>) {
         starts.clear();
-        // Beyond the levels of a byte, one step further is as good as any.
+        // A whole number is beyond `level` if it is beyond the whole number next before it, seen from the ground. Outside the levels of a byte,
+        // one step further is as good as any.
         let bound = if sense > 0.0 { level.floor() } else { level.ceil() }.clamp(-1.0, 256.0) as i16;
         for (y, row) in self.pixels.chunks_exact(self.width).enumerate() {
             let change = |x, begins| {
@@ -75,6 +78,9 @@ impl Raw<'_> {
 
     /// The picture at half the resolution: means of 2 x 2 pixels; of an odd side the last pixel counts twice.
     pub(super) fn halved<'a>(&self, halved: &'a mut Vec<u8>) -> Raw<'a> {
+        /// Every other byte of a word, and a two in each of these places.
+        const EVEN_BYTES: u64 = 0x00ff_00ff_00ff_00ff;
+        const TWOS: u64 = 0x0002_0002_0002_0002;
         let (width, height) = (self.width.div_ceil(2), self.height.div_ceil(2));
         halved.clear();
         halved.resize(width * height, 0);
@@ -101,15 +107,14 @@ impl Raw<'_> {
 /// The cells of a picture round a contour, blurred.
 #[derive(Debug, Clone, Default)]
 pub(super) struct Band {
-    width: usize,
-    height: usize,
     /// Cells in a row.
     columns: usize,
     /// For each cell where its levels begin, or [`OUTSIDE_BAND`].
     cells: Vec<usize>,
     /// Levels of the cells' pixels, in parts of a grey level.
     levels: Vec<u16>,
-    across: Vec<u16>,
+    /// Memory for a line of neighbouring cells: blurred across the rows only, and both ways.
+    half_blurred: Vec<u16>,
     blurred: Vec<[u16; CELL]>,
 }
 
@@ -123,40 +128,36 @@ const PARTS: f32 = (1 << LEVEL_BITS) as f32;
 /// A Gaussian kernel ends here, in standard deviations.
 const KERNEL_EXTENT: f64 = 3.0;
 
-/// Every other byte of a word, and a two in each of these places.
-const EVEN_BYTES: u64 = 0x00ff_00ff_00ff_00ff;
-const TWOS: u64 = 0x0002_0002_0002_0002;
-
 impl Band {
     /// Takes the cells that a contour goes through, and their neighbours.
     pub(super) fn mark(&mut self, contour: impl Iterator<Item = Point>, [width, height]: [usize; 2]) {
-        (self.width, self.height) = (width, height);
         self.columns = width.div_ceil(CELL);
         let rows = height.div_ceil(CELL);
         self.cells.clear();
         self.cells.resize(self.columns * rows, OUTSIDE_BAND);
-        let mut last = OUTSIDE_BAND;
+        let mut marked = None;
         for p in contour {
             let (column, row) = ((p.x as usize / CELL).min(self.columns - 1), (p.y as usize / CELL).min(rows - 1));
-            if std::mem::replace(&mut last, row * self.columns + column) == last {
+            if marked.replace((column, row)) == Some((column, row)) {
                 continue;
             }
             let columns = column.saturating_sub(1)..self.columns.min(column + 2);
             for row in row.saturating_sub(1)..rows.min(row + 2) {
+                // Any number but that of cells outside; what it is follows when all are known.
                 self.cells[row * self.columns + columns.start..row * self.columns + columns.end].fill(0);
             }
         }
-        let mut count = 0;
+        let mut begin = 0;
         for cell in self.cells.iter_mut().filter(|c| **c != OUTSIDE_BAND) {
-            *cell = count * CELL * CELL;
-            count += 1;
+            *cell = begin;
+            begin += CELL * CELL;
         }
         self.levels.clear();
-        self.levels.resize(count * CELL * CELL, 0);
+        self.levels.resize(begin, 0);
     }
 
     /// Neighbouring cells of a row: the row, and the columns from the first to one past the last.
-    fn stretches(&self) -> impl Iterator<Item = (usize, std::ops::Range<usize>)> {
+    fn stretches(&self) -> impl Iterator<Item = (usize, Range<usize>)> {
         self.cells.chunks_exact(self.columns.max(1)).enumerate().flat_map(|(row, cells)| {
             let mut from = 0;
             std::iter::from_fn(move || {
@@ -168,84 +169,94 @@ impl Band {
         })
     }
 
-    /// Separable Gaussian blur of the cells; the picture is continued by its outermost pixels, which then become `ground`, so that
-    /// contours close within. `starts` becomes where rows of cells go over to what `is_shape`.
+    /// Separable Gaussian blur of the marked cells of a picture, which is continued by its outermost pixels; these become `ground` then, so
+    /// that contours close within. `starts` becomes where rows of cells go over to what `is_shape`.
     pub(super) fn blur(
         &mut self,
-        pixels: &[u8],
+        picture: Raw<'_>,
         sigma: f64,
         ground: f32,
         is_shape: impl Fn(f32) -> bool,
         starts: &mut Vec<Start>,
     ) {
         let weights = kernel(sigma);
-        let reach = weights.len() - 1;
-        let (width, height) = (self.width, self.height);
+        let (width, height) = (picture.width, picture.height);
         let ground = (ground.clamp(0.0, 255.0) * PARTS) as u16;
-        let (mut across, mut blurred) = (std::mem::take(&mut self.across), std::mem::take(&mut self.blurred));
+        let mut half_blurred = std::mem::take(&mut self.half_blurred);
+        let mut blurred = std::mem::take(&mut self.blurred);
         let mut levels = std::mem::take(&mut self.levels);
         starts.clear();
         for (row, columns) in self.stretches() {
-            let (start, count) = (columns.start * CELL, columns.len() * CELL);
-            // Pixels that the kernel needs, and how many of them lie beyond the picture.
-            let (from, to) = (start.saturating_sub(reach), width.min(start + count + reach));
-            let before = reach + from - start;
+            let pixels = columns.start * CELL..columns.end * CELL;
             for y in row * CELL..height.min((row + 1) * CELL) {
-                let row_at = |y: usize| &pixels[y.min(height - 1) * width..][from..to];
-                across.clear();
-                across.resize(count + 2 * reach, 0);
-                let sums = &mut across[before..before + to - from];
-                for (sum, p) in sums.iter_mut().zip(row_at(y)) {
-                    *sum = scaled(u16::from(*p) << LEVEL_BITS, weights[0]);
-                }
-                for (offset, &weight) in weights.iter().enumerate().skip(1) {
-                    let both = row_at(y.saturating_sub(offset)).iter().zip(row_at(y + offset));
-                    for (sum, (above, below)) in sums.iter_mut().zip(both) {
-                        *sum += scaled((u16::from(*above) + u16::from(*below)) << LEVEL_BITS, weight);
-                    }
-                }
-                let (first, last) = (sums[0], sums[sums.len() - 1]);
-                across[..before].fill(first);
-                across[before + to - from..].fill(last);
-                blurred.clear();
-                for at in (0..columns.len()).map(|k| k * CELL + reach) {
-                    let centre = cell_at(&across, at);
-                    let mut sum = [0u16; CELL];
-                    for i in 0..CELL {
-                        sum[i] = scaled(centre[i], weights[0]);
-                    }
-                    for (offset, &weight) in weights.iter().enumerate().skip(1) {
-                        let (left, right) = (cell_at(&across, at - offset), cell_at(&across, at + offset));
-                        for i in 0..CELL {
-                            sum[i] += scaled(left[i] + right[i], weight);
-                        }
-                    }
-                    blurred.push(sum);
-                }
+                blur_across_rows(picture, y, pixels.clone(), &weights, &mut half_blurred);
+                blur_along_row(&half_blurred, &weights, &mut blurred);
                 let line = blurred.as_flattened_mut();
-                if start == 0 {
+                if pixels.start == 0 {
                     line[0] = ground;
                 }
                 // The picture's last pixel, and what cells have beyond it.
-                line[(width - 1 - start).min(count)..].fill(ground);
+                line[(width - 1 - pixels.start).min(pixels.len())..].fill(ground);
                 if y == 0 || y == height - 1 {
                     line.fill(ground);
                 }
-                changes(
-                    line,
-                    |level| is_shape(f32::from(level) / PARTS),
-                    |x, begins| {
-                        if begins {
-                            starts.push(Start { x: start + x, y });
-                        }
-                    },
-                );
+                let change = |x, begins| {
+                    if begins {
+                        starts.push(Start { x: pixels.start + x, y });
+                    }
+                };
+                changes(line, |level| is_shape(f32::from(level) / PARTS), change);
                 for (column, part) in columns.clone().zip(&blurred) {
                     levels[self.cells[row * self.columns + column] + y % CELL * CELL..][..CELL].copy_from_slice(part);
                 }
             }
         }
-        (self.across, self.blurred, self.levels) = (across, blurred, levels);
+        (self.half_blurred, self.blurred, self.levels) = (half_blurred, blurred, levels);
+    }
+}
+
+/// Blurs the pixels of row `y` against those above and below, with so many more on either side as blurring along the row needs.
+fn blur_across_rows(picture: Raw<'_>, y: usize, pixels: Range<usize>, weights: &[u16], line: &mut Vec<u16>) {
+    let (width, height) = (picture.width, picture.height);
+    let reach = weights.len() - 1;
+    let (from, to) = (pixels.start.saturating_sub(reach), width.min(pixels.end + reach));
+    let row_at = |y: usize| &picture.pixels[y.min(height - 1) * width..][from..to];
+    line.clear();
+    line.resize(pixels.len() + 2 * reach, 0);
+    // Some may lie beyond the picture.
+    let before = reach + from - pixels.start;
+    let sums = &mut line[before..before + to - from];
+    for (sum, p) in sums.iter_mut().zip(row_at(y)) {
+        *sum = scaled(u16::from(*p) << LEVEL_BITS, weights[0]);
+    }
+    for (offset, &weight) in weights.iter().enumerate().skip(1) {
+        let both = row_at(y.saturating_sub(offset)).iter().zip(row_at(y + offset));
+        for (sum, (above, below)) in sums.iter_mut().zip(both) {
+            *sum += scaled((u16::from(*above) + u16::from(*below)) << LEVEL_BITS, weight);
+        }
+    }
+    let (first, last) = (sums[0], sums[sums.len() - 1]);
+    line[..before].fill(first);
+    line[before + to - from..].fill(last);
+}
+
+/// Blurs a line, cell by cell; what the kernel needs on either side is not of a cell.
+fn blur_along_row(line: &[u16], weights: &[u16], blurred: &mut Vec<[u16; CELL]>) {
+    let reach = weights.len() - 1;
+    blurred.clear();
+    for at in (reach..line.len() - reach).step_by(CELL) {
+        let centre = cell_at(line, at);
+        let mut sum = [0u16; CELL];
+        for i in 0..CELL {
+            sum[i] = scaled(centre[i], weights[0]);
+        }
+        for (offset, &weight) in weights.iter().enumerate().skip(1) {
+            let (left, right) = (cell_at(line, at - offset), cell_at(line, at + offset));
+            for i in 0..CELL {
+                sum[i] += scaled(left[i] + right[i], weight);
+            }
+        }
+        blurred.push(sum);
     }
 }
 

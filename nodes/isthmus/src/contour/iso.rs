@@ -75,12 +75,15 @@ impl<P: Picture> Raster<P> {
         self.sense * (self.picture.at(x, y) - self.level)
     }
 
-    /// How deep within the shape a pixel lies, in units of the edge's blur, from its difference from the level: the inverse of the
-    /// error function, by its series. Between pixels it is linear across an edge, as the grey level is not.
+    /// How deep within the shape a pixel lies, from its difference from the level: in proportion to the inverse of the error function that a
+    /// blurred edge is, by its series. Between pixels it is linear across an edge, as the grey level is not.
     fn depth(&self, value: f32) -> f32 {
+        /// Coefficients of the third and fifth power, beside 1 of the first.
+        const CUBIC: f32 = std::f32::consts::FRAC_PI_3;
+        const QUINTIC: f32 = 7.0 * std::f32::consts::PI * std::f32::consts::PI / 30.0;
         let part = (value / self.contrast).clamp(-0.5, 0.5);
         let square = part * part;
-        part * (1.0 + square * (std::f32::consts::FRAC_PI_3 + square * 2.303))
+        part * (1.0 + square * (CUBIC + square * QUINTIC))
     }
 
     /// Follows the contour that runs up between the pixels `(x - 1, y)` (ground) and `(x, y)` (shape), the shape on its
@@ -89,10 +92,13 @@ impl<P: Picture> Raster<P> {
         contour.clear();
         let [width, _] = self.picture.size();
         let value = |x: usize, y: usize| self.value(x, y);
-        let (start_x, start_y) = (x - 1, y - 1);
-        let (mut x, mut y, mut entry) = (start_x, start_y, Side::Bottom);
+        // Cells are named by their upper left pixel; a walk ends where it would enter its first cell as it did at first.
+        let start = (x - 1, y - 1, Side::Bottom);
+        let (mut x, mut y, mut entry) = start;
         loop {
             let (a, b, c, d) = (value(x, y), value(x + 1, y), value(x + 1, y + 1), value(x, y + 1));
+            // Which corners are shape, clockwise from the upper left one. The contour leaves by the side that has, looking outwards, ground at
+            // its left end and shape at its right one; where there are two, by one or the other.
             let corners = u8::from(a > 0.0) | u8::from(b > 0.0) << 1 | u8::from(c > 0.0) << 2 | u8::from(d > 0.0) << 3;
             let joined = || a + b + c + d > 0.0;
             let exit = match corners {
@@ -125,7 +131,7 @@ impl<P: Picture> Raster<P> {
                 Side::Bottom => (x, y + 1, Side::Top),
                 Side::Left => (x - 1, y, Side::Right),
             };
-            if (x, y) == (start_x, start_y) && entry == Side::Bottom {
+            if (x, y, entry) == start {
                 return;
             }
         }
