@@ -46,7 +46,7 @@ pub fn run(args: CellArgs) -> ExitCode {
     }
     let result = Process::start(NAME, ros).and_then(|process| {
         process.only_ros_arguments()?;
-        process.composed_of(TABLES).run(open)
+        process.composed_of(TABLES).started_again().run(open)
     });
     process::exit_code(NAME, result)
 }

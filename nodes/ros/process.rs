@@ -5,13 +5,18 @@
 //! | 0 | ended by SIGINT or SIGTERM, or done |
 //! | 1 | the middleware could not be opened |
 //! | 2 | bad command line, parameter or environment; one line says what |
-//! | 3 | the node had gone deaf (see below) and is to be started again |
+//! | 3 | the node had gone deaf, or to some (see below), and is to be started again |
 //!
 //! **Signals** are blocked on every thread, and one thread waits for them. A handler that ran on one of RustDDS's own
 //! threads would interrupt its poll, after which that thread ends for good and the node lives on deaf. SIGSTOP and
 //! SIGCONT interrupt polls all the same; so a **watchdog** looks whether RustDDS's threads still live and ends the
 //! process where one has gone, so that whoever started it starts it again.
+//!
+//! **Whoever was forgotten and comes back** (a link was down for longer than the lease, 50 s) stays a stranger: RustDDS
+//! has taken its announcements of endpoints once and takes them for known when they come again. A node that sees that ends
+//! as well; with its new identity both sides find each other as new.
 
+use std::collections::VecDeque;
 use std::net::{IpAddr, Ipv4Addr};
 use std::path::Path;
 use std::process::ExitCode;
@@ -28,7 +33,7 @@ use jigsaw_msgs::std_msgs::msg::Header;
 use nix::sys::resource::{Resource, getrlimit, setrlimit};
 use nix::sys::signal::{SigSet, Signal};
 use ros2_client::{Context, NodeName, NodeOptions};
-use rustdds::dds::statusevents::{DomainParticipantStatusEvent, StatusEvented};
+use rustdds::dds::statusevents::{DomainParticipantStatusEvent, LostReason, StatusEvented};
 use rustdds::{DomainParticipant, DomainParticipantBuilder, RTPSEntity};
 
 use super::activity::Activity;
@@ -104,6 +109,9 @@ const REPORT_PERIOD: Duration = Duration::from_secs(1);
 /// need not kill it.
 const END_PATIENCE: Duration = Duration::from_millis(800);
 
+/// Most participants that are remembered as forgotten; beyond, those that have been away longest are not expected back.
+const MOST_FORGOTTEN: usize = 1024;
+
 /// Beginning of the names of RustDDS's threads.
 const MIDDLEWARE_THREADS: &str = "RustDDS";
 
@@ -134,6 +142,11 @@ pub enum ProcessError {
     /// A thread of the middleware has ended.
     #[error("the middleware has gone deaf (its thread '{0}' ended, as it does after SIGSTOP); start this node again")]
     Deaf(String),
+    /// One that was forgotten has come back.
+    #[error(
+        "participant {0} was away for longer than its lease and has come back, and the middleware can't find its topics again; start this node again"
+    )]
+    Estranged(String),
 }
 
 impl ProcessError {
@@ -142,7 +155,7 @@ impl ProcessError {
         match self {
             Self::Args(_) | Self::Parameter(_) | Self::Configuration(_) | Self::Session(SessionError::Name(_)) => 2,
             Self::Session(_) | Self::System { .. } => 1,
-            Self::Deaf(_) => 3,
+            Self::Deaf(_) | Self::Estranged(_) => 3,
         }
     }
 }
@@ -174,7 +187,7 @@ pub fn main(program: Program, open: impl FnOnce(Session) -> Result<Work, Process
     }
     let result = Process::start(program.name, args).and_then(|process| {
         process.only_ros_arguments()?;
-        process.run(|process| open(process.node(program.name, program.parameters)?))
+        process.started_again().run(|process| open(process.node(program.name, program.parameters)?))
     });
     exit_code(program.name, result)
 }
@@ -226,6 +239,8 @@ pub struct Process {
     ending: Option<oneshot::Sender<()>>,
     /// The parameters of all nodes of a composed process: one that another node has is no mistake.
     tables: &'static [&'static [Spec]],
+    /// Whether it is started again where it ends by a fault.
+    started_again: bool,
 }
 
 impl Process {
@@ -248,6 +263,7 @@ impl Process {
             turn: None,
             ending: None,
             tables: &[],
+            started_again: false,
         })
     }
 
@@ -255,6 +271,11 @@ impl Process {
     /// passed over by the others.
     pub fn composed_of(self, tables: &'static [&'static [Spec]]) -> Self {
         Self { tables, ..self }
+    }
+
+    /// Says that whoever started this process starts it again where it ends by a fault.
+    pub fn started_again(self) -> Self {
+        Self { started_again: true, ..self }
     }
 
     /// Checks that nothing but ROS arguments was given.
@@ -343,9 +364,8 @@ impl Process {
                 }
             })
             .map_err(|e| ProcessError::System { what: "starting a thread", reason: e.to_string() })?;
-        if let Some((participant, _)) = &self.participant {
-            self.executor.spawn(follow_discovery(participant.clone(), self.endpoints.clone())).detach();
-        }
+        let participant = self.participant.as_ref().map(|(participant, _)| participant.clone());
+        let discovery = follow_discovery(participant, self.endpoints.clone(), self.started_again);
         if let Some(turn) = self.turn.take() {
             self.executor.spawn(turn.done()).detach();
         }
@@ -356,6 +376,7 @@ impl Process {
                 result = work.fuse() => result,
                 _ = signalled.fuse() => Ok(()),
                 error = watchdog().fuse() => Err(error),
+                error = Box::pin(discovery).fuse() => Err(error),
             }
         }));
         logging::remove_nodes();
@@ -530,8 +551,15 @@ fn report(session: &mut Session) -> Result<(), SessionError> {
     Ok(())
 }
 
-/// Keeps account of who listens, and warns of those who would but can't.
-async fn follow_discovery(participant: DomainParticipant, endpoints: Endpoints) {
+/// Keeps account of who listens, and warns of those who would but can't. Resolves when one that was forgotten comes back,
+/// if this process is started again then; otherwise that is a warning, too.
+async fn follow_discovery(
+    participant: Option<DomainParticipant>,
+    endpoints: Endpoints,
+    started_again: bool,
+) -> ProcessError {
+    let Some(participant) = participant else { return std::future::pending().await };
+    let mut forgotten = VecDeque::new();
     let listener = participant.status_listener();
     let mut events = listener.as_async_status_stream();
     while let Some(event) = events.next().await {
@@ -547,8 +575,20 @@ async fn follow_discovery(participant: DomainParticipant, endpoints: Endpoints) 
                 }
             }
             DomainParticipantStatusEvent::ReaderLost { guid, .. } => endpoints.lost(guid),
-            DomainParticipantStatusEvent::ParticipantLost { id, .. } => {
-                endpoints.lost_all(|reader| reader.prefix == id)
+            DomainParticipantStatusEvent::ParticipantLost { id, reason } => {
+                endpoints.lost_all(|reader| reader.prefix == id);
+                if matches!(reason, LostReason::Timeout { .. }) {
+                    forgotten.truncate(MOST_FORGOTTEN - 1);
+                    forgotten.push_front(id);
+                }
+            }
+            DomainParticipantStatusEvent::ParticipantDiscovered { dpd } if forgotten.contains(&dpd.guid.prefix) => {
+                forgotten.retain(|id| *id != dpd.guid.prefix);
+                let error = ProcessError::Estranged(format!("{:?}", dpd.guid.prefix));
+                if started_again {
+                    return error;
+                }
+                log::warn!("{error}");
             }
             DomainParticipantStatusEvent::RemoteReaderQosIncompatible {
                 local_writer: local,
@@ -565,6 +605,8 @@ async fn follow_discovery(participant: DomainParticipant, endpoints: Endpoints) 
             _ => {}
         }
     }
+    // The participant is about to go.
+    std::future::pending().await
 }
 
 fn warn_of_incompatible(

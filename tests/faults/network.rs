@@ -125,6 +125,13 @@ impl Drop for Network {
     }
 }
 
+/// What becomes of feature nodes that have ended.
+#[derive(Clone, Copy)]
+enum Ended {
+    StayAway,
+    StartAgain,
+}
+
 /// The nodes on their hosts.
 struct Spread {
     _capture: Cell,
@@ -136,7 +143,7 @@ struct Spread {
 }
 
 impl Spread {
-    fn start(network: &Network, folder: &Path, environment: &[(&'static str, String)]) -> Self {
+    fn start(network: &Network, folder: &Path, environment: &[(&'static str, String)], feature_nodes: Ended) -> Self {
         let domain = domain::free();
         let mut environment = environment.to_vec();
         environment.push(("ROS_DOMAIN_ID", domain.to_string()));
@@ -151,11 +158,17 @@ impl Spread {
         // Which interface is used is a parameter.
         let interfaces = format!("network_interfaces:=[127.0.0.1, {}]", network.address(CAPTURE));
         let solver = node(SOLVER, "solver_node", "solver.log", &["-p", &expected]);
-        // Without the script, so that one that has ended stays away.
         let feature = |name: &str| {
-            let command = network.on(FEATURE, &binaries().join("feature_node"));
-            let args = ["--ros-args", "-p", "share:=true", "-r", &format!("__node:={name}")];
-            Cell::start_by(command, folder.join(format!("{name}.log")), &environment, &args)
+            let (log, renamed) = (format!("{name}.log"), format!("__node:={name}"));
+            let args = ["-p", "share:=true", "-r", &renamed];
+            match feature_nodes {
+                Ended::StartAgain => node(FEATURE, "feature_node", &log, &args),
+                // Without the script.
+                Ended::StayAway => {
+                    let command = network.on(FEATURE, &binaries().join("feature_node"));
+                    Cell::start_by(command, folder.join(log), &environment, &[&["--ros-args"], &args[..]].concat())
+                }
+            }
         };
         let features = FEATURES.map(feature);
         let capture = node(CAPTURE, "capture_node", "capture.log", &["-p", &interfaces]);
@@ -200,7 +213,7 @@ fn solve_under(test: u8, orders: &[&str]) {
     let Some(mut network) = Network::new(test) else { return };
     let folder = Folder::new(&format!("network-{test}"));
     orders.iter().for_each(|order| network.order(order));
-    let spread = Spread::start(&network, &folder.0, &[]);
+    let spread = Spread::start(&network, &folder.0, &[], Ended::StayAway);
     let begun = Instant::now();
     let _camera = spread.play(&network, &["--rate", "0"]);
     spread.solved();
@@ -214,7 +227,7 @@ fn solve_without(lost: Signal, test: u8, orders: &[&str], is_static: bool) {
     orders.iter().for_each(|order| network.order(order));
     let peers = [CAPTURE, FEATURE, SOLVER, HERE].map(|host| network.address(host).to_string()).join(";");
     let environment = if is_static { vec![("ROS_STATIC_PEERS", peers)] } else { Vec::new() };
-    let spread = Spread::start(&network, &folder.0, &environment);
+    let spread = Spread::start(&network, &folder.0, &environment, Ended::StayAway);
     // Slowly: when the two are seen to share, there must be pieces left to take over.
     let _camera = spread.play(&network, &["--loop", "--rate", "0.4"]);
     spread.shared();
@@ -266,7 +279,7 @@ fn solve_after_a_cut(test: u8, cut: Duration, is_static: bool) {
     if is_static {
         network.order("multicast off");
     }
-    let spread = Spread::start(&network, &folder.0, &environment);
+    let spread = Spread::start(&network, &folder.0, &environment, Ended::StartAgain);
     let _camera = spread.play(&network, &["--loop", "--rate", "1"]);
     spread.shared();
     let feature = network.ports[FEATURE].clone();
