@@ -5,7 +5,7 @@
 //! whole difference are exact. Neck width and path length are windows that each candidate must pass. Building is
 //! O(n log n), a query O(k log n) on the clustered shapes of tabs (measured growth: see the benches).
 
-use crate::outline::{KEYS, SHAPE_SAMPLES, Segment};
+use crate::outline::{KEYS, Outline, SHAPE_SAMPLES, Segment};
 
 /// Entries a leaf of the tree holds: below this a linear scan is faster than descending.
 const LEAF: usize = 16;
@@ -21,6 +21,13 @@ pub(crate) struct Entry<'a> {
     pub(crate) segment: &'a Segment,
 }
 
+/// Window on the difference of mouth and neck width, in piece scales: clearance on both sides (3 % each) and the
+/// uncertainty of a flat minimum on both.
+const OPENING_WINDOW: f64 = 0.15;
+/// Window on the difference of path lengths, in piece scales: the critical points of a neck with near-parallel sides
+/// may slide along it.
+const PATH_WINDOW: f64 = 0.4;
+
 /// Which differences of width and path length (mouth less neck), in pixels, a candidate may have.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct Windows {
@@ -29,6 +36,12 @@ pub(crate) struct Windows {
 }
 
 impl Windows {
+    /// What the mouths of a piece allow.
+    pub(crate) fn of(outline: &Outline) -> Self {
+        let (w, p) = (OPENING_WINDOW * outline.scale, PATH_WINDOW * outline.scale);
+        Self { opening: (-w, w), path: (-p, p) }
+    }
+
     pub(crate) fn let_opening_pass(&self, mouth: &Segment, tab: &Segment) -> bool {
         let opening = mouth.width - tab.width;
         opening >= self.opening.0 && opening <= self.opening.1

@@ -12,6 +12,7 @@ pub mod correlation;
 mod frame;
 mod index;
 mod loops;
+mod matching;
 mod outline;
 mod paper;
 pub mod params;

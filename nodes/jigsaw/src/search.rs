@@ -7,7 +7,7 @@
 //!    ([`crate::posegraph`]).
 //! 3. [`grow`]: islands and single pieces joined by the candidates that agree on a pose.
 //! 4. [`verify`]: pieces that overlap or contradict their neighbours are taken out, and others tried in their place.
-//! 5. [`fill`]: pieces that isthmuses don't decide, by their whole border.
+//! 5. [`widen`], [`fill`]: what is left over, by a second look at what is open, and by whole borders.
 //! 6. [`outcome`]: which contacts are matings, and how sure all that is.
 //!
 //! What the steps change and take back is [`state`].
@@ -21,6 +21,7 @@ mod learn;
 mod outcome;
 mod state;
 mod verify;
+mod widen;
 
 use crate::contact::{ClearancePrior, Memory};
 use crate::copies::copies;
@@ -53,9 +54,9 @@ pub(crate) struct Mated {
 /// The poses found.
 #[derive(Debug, Clone, Default)]
 pub(crate) struct Outcome {
-    /// The candidates, and behind them so many contacts that the assembly showed.
+    /// The candidates, and behind them so many that the assembly brought up: contacts, and what a second look found.
     pub(crate) joints: Vec<Joint>,
-    pub(crate) contacts: usize,
+    pub(crate) brought_up: usize,
     /// Island and pose (island from image) of each piece; `None` if left over.
     pub(crate) poses: Vec<Option<(usize, Isometry2<f64>)>>,
     /// Loop support of each joint.
@@ -76,12 +77,15 @@ struct Assembler<'a> {
     joints: Vec<Joint>,
     /// What the search needs of the joints, one by one.
     edges: Vec<Edge>,
-    /// How many of them were found as contacts.
+    /// How many were given, and how many were found as contacts.
+    given: usize,
     contacts: usize,
     /// Candidates at each piece.
     at: Vec<Vec<usize>>,
     scale: f64,
     prior: ClearancePrior,
+    /// Whether the clearance is known from this puzzle.
+    calibrated: bool,
     /// What true and false candidates cost.
     model: Model,
     /// How loops close.
@@ -124,12 +128,14 @@ pub(crate) fn assemble(
         params,
         memory,
         budget,
+        given: joints.len(),
         joints,
         edges,
         contacts: 0,
         at,
         scale,
         prior: ClearancePrior { mean: 0.0, deviation: 0.01 * scale, noise: noise.max(0.02) },
+        calibrated: false,
         model: Model {
             right: ((1.5 * noise + 0.001 * scale).ln(), 0.4),
             wrong: ((1.5 * noise + 0.01 * scale).ln(), 0.5),
@@ -200,6 +206,10 @@ impl Assembler<'_> {
             self.verify();
         }
         if self.state.largest() < self.outlines.len() {
+            if self.widen() {
+                self.grow();
+                self.verify();
+            }
             self.refine_all(1, FINE);
             self.fill();
         }

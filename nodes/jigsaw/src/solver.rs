@@ -2,13 +2,16 @@
 
 use crate::contact::Memory;
 use crate::correlation::correlate;
-use crate::index::{Entry, Hit, Index, Windows, shape_distance};
+use crate::index::{Entry, Index, Windows, shape_distance};
+use crate::matching::{List, Match};
 use crate::outline::{Outline, Segment};
 use crate::paper;
 use crate::params::{Budget, Time};
 use crate::placement::Joint;
 use crate::search::{self, Mated, Outcome};
-use crate::{Assembly, Mating, Params, ParamsError, Piece, Placement, Policy, TableCounts, Timings, frame, placement};
+use crate::{
+    Assembly, Mating, Params, ParamsError, Piece, Placement, Policy, TableCounts, Timings, frame, matching, placement,
+};
 use nalgebra::Isometry2;
 use rayon::prelude::*;
 use std::collections::HashMap;
@@ -16,13 +19,6 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Instant;
 use thiserror::Error;
-
-/// Window on the difference of mouth and neck width, in piece scales: clearance on both sides (3 % each) and the
-/// uncertainty of a flat minimum on both.
-const OPENING_WINDOW: f64 = 0.15;
-/// Window on the difference of path lengths, in piece scales: the critical points of a neck with near-parallel sides
-/// may slide along it.
-const PATH_WINDOW: f64 = 0.4;
 
 /// A rule that drops a candidate.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, serde::Serialize)]
@@ -133,26 +129,6 @@ pub enum SolverError {
         /// What the system says.
         reason: String,
     },
-}
-
-/// A tab that may fit a mouth.
-#[derive(Debug, Clone, Copy)]
-struct Match {
-    hit: Hit,
-    /// `None` where not even a rough pose was found.
-    rough: Option<placement::Rough>,
-    /// Coarse fit, of the roughly best only, and refined fit, of the best of these.
-    coarse: Option<placement::Fit>,
-    fine: Option<placement::Fit>,
-}
-
-/// The tabs that resemble a mouth most.
-#[derive(Debug, Clone, Default)]
-struct List {
-    /// Nearest first.
-    matches: Vec<Match>,
-    /// Place and fit of those that were good enough to be refined; none where they have to be chosen.
-    fits: Option<Vec<(usize, placement::Fit)>>,
 }
 
 /// What is kept of one piece.
@@ -328,7 +304,7 @@ impl Solver {
         self.memory.next_solution();
         let outlines = ranked(&self.kept, &order);
         let outcome = search::assemble(&outlines, joints, &self.params, &self.memory, budget);
-        add_contacts(&mut table, &outlines, &outcome);
+        self.count_brought_up(&mut table, &order, &outlines, &outcome);
         let mut assembly = report(&order, &outlines, &outcome);
         assembly.table = TableCounts { backtracks: outcome.backtracks, ..table };
         assembly.partial = outcome.partial || !whole;
@@ -380,19 +356,17 @@ impl Solver {
                 let matches = &mut list.matches;
                 // Ranks shift with each new id.
                 matches.iter_mut().for_each(|m| m.hit.rank = rank[m.hit.piece as usize] as u32);
-                for hit in index.nearest(mouth, piece as u32, &windows(outline), most) {
+                for hit in index.nearest(mouth, piece as u32, &Windows::of(outline), most) {
                     let place = matches.partition_point(|m: &Match| m.hit.order(&hit).is_lt());
                     let known = matches.get(place).is_some_and(|m| (m.hit.piece, m.hit.tab) == (hit.piece, hit.tab));
                     if place >= most || known {
                         continue;
                     }
-                    let tab = &outlines[hit.piece as usize].tabs[hit.tab as usize];
-                    let rough = placement::rough(tab, mouth, outline.scale, free, feet);
-                    matches.insert(place, Match { hit, rough, coarse: None, fine: None });
+                    matches.insert(place, Match::new(hit, mouth, &outlines, (outline.scale, free), feet));
                     matches.truncate(most);
                     list.fits = None;
                 }
-                let choose = || refine(matches, mouth, &outlines, (outline.scale, free), feet);
+                let choose = || matching::refine(matches, mouth, &outlines, (outline.scale, free), feet);
                 list.fits.get_or_insert_with(choose);
             }
             *current = true;
@@ -419,6 +393,21 @@ impl Solver {
             }
         }
         (joints, near)
+    }
+
+    /// Counts the candidates that the assembly brought up among what each rule left, whatever the rule had said.
+    fn count_brought_up(&self, table: &mut TableCounts, order: &[usize], outlines: &[&Outline], outcome: &Outcome) {
+        for j in &outcome.joints[outcome.joints.len() - outcome.brought_up..] {
+            if !self.kept[order[j.b]].lists.get(j.mouth).is_some_and(|list| list.names(order[j.a], j.tab)) {
+                let (tab, mouth) = (&outlines[j.a].tabs[j.tab], &outlines[j.b].mouths[j.mouth]);
+                let windows = Windows::of(outlines[j.b]);
+                let opens = windows.let_opening_pass(mouth, tab);
+                table.after_opening += usize::from(!opens);
+                table.after_length += usize::from(!(opens && windows.let_path_pass(mouth, tab)));
+                table.after_correlation += 1;
+            }
+            table.after_overlap += usize::from(!hopeless(j, outlines[j.b]));
+        }
     }
 
     /// The candidate table of the last [`Solver::solve`]: pairs of a tab and a mouth of different pieces, each with its
@@ -485,9 +474,9 @@ impl Solver {
         let known: std::collections::HashSet<_> = joints.iter().map(|j| (j.a, j.tab, j.b, j.mouth)).collect();
         let judge = paper::Judge::new(&outlines);
         for (b, o) in outlines.iter().enumerate() {
-            let windows = windows(o);
+            let windows = Windows::of(o);
             for (mouth, m) in o.mouths.iter().enumerate() {
-                let list = self.kept[order[b]].lists.get(mouth).map_or(&[][..], |l| &l.matches[..]);
+                let list = self.kept[order[b]].lists.get(mouth);
                 for (a, other) in outlines.iter().enumerate().filter(|(a, _)| *a != b) {
                     for (tab, t) in other.tabs.iter().enumerate() {
                         if known.contains(&(a, tab, b, mouth)) {
@@ -500,7 +489,7 @@ impl Solver {
                             Rule::Opening
                         } else if !windows.let_path_pass(m, t) {
                             Rule::PathLength
-                        } else if list.iter().any(|l| (l.hit.piece as usize, l.hit.tab as usize) == (order[a], tab)) {
+                        } else if list.is_some_and(|list| list.names(order[a], tab)) {
                             Rule::Placement
                         } else {
                             Rule::Shape
@@ -581,19 +570,6 @@ fn count(outlines: &[&Outline], joints: &[Joint], near: usize) -> TableCounts {
     table
 }
 
-/// Counts the contacts that the assembly found among what each rule left: they are matings, whatever the rule said.
-fn add_contacts(table: &mut TableCounts, outlines: &[&Outline], outcome: &Outcome) {
-    for j in &outcome.joints[outcome.joints.len() - outcome.contacts..] {
-        let (windows, tab, mouth) =
-            (windows(outlines[j.b]), &outlines[j.a].tabs[j.tab], &outlines[j.b].mouths[j.mouth]);
-        let opens = windows.let_opening_pass(mouth, tab);
-        table.after_opening += usize::from(!opens);
-        table.after_length += usize::from(!(opens && windows.let_path_pass(mouth, tab)));
-        table.after_correlation += 1;
-        table.after_overlap += usize::from(!hopeless(j, outlines[j.b]));
-    }
-}
-
 /// How many pairs pass the opening window, and how many the window of path lengths as well: counted by a sweep over the
 /// widths with a tree of sums over the path lengths (Fenwick 1994), O(n log n) in all, and the pairs within one piece
 /// taken off.
@@ -606,7 +582,7 @@ fn within_windows(outlines: &[&Outline]) -> (usize, usize) {
     let mut questions: Vec<(usize, bool, usize, usize)> = Vec::new();
     let (mut opening, mut length) = (0, 0);
     for o in outlines {
-        let w = windows(o);
+        let w = Windows::of(o);
         for m in &o.mouths {
             let own: Vec<&Segment> = o.tabs.iter().filter(|t| w.let_opening_pass(m, t)).collect();
             let from = tabs.partition_point(|t| m.width - t.0 > w.opening.1);
@@ -645,66 +621,6 @@ fn within_windows(outlines: &[&Outline]) -> (usize, usize) {
     (opening, length.max(0) as usize)
 }
 
-/// Candidates of a mouth that are refined in any case.
-const REFINED: usize = 4;
-/// More are fitted coarsely if their rough residual is at most this many times the best one's, and this much more, in
-/// piece scales: what a rough pose may be off.
-const ROUGHLY: (f64, f64) = (2.0, 0.0015);
-/// The same for a refined fit, by the residuals of the coarse ones.
-const COARSELY: (f64, f64) = (1.5, 0.001);
-
-/// Those of some places in a mouth's list whose residual is within `near` of the least, but at least [`REFINED`]; best
-/// first.
-fn best(list: &[Match], residuals: impl Iterator<Item = (f64, usize)>, near: (f64, f64), scale: f64) -> Vec<usize> {
-    let mut places: Vec<(f64, usize)> = residuals.collect();
-    places.sort_by(|p, q| p.0.total_cmp(&q.0).then(list[p.1].hit.order(&list[q.1].hit)));
-    let limit = places.first().map_or(0.0, |p| near.0 * p.0 + near.1 * scale);
-    let within = places.partition_point(|p| p.0 <= limit);
-    places.truncate(within.max(REFINED));
-    places.into_iter().map(|p| p.1).collect()
-}
-
-/// Places in a mouth's list of the candidates to fit coarsely.
-fn roughly_best(list: &[Match], scale: f64) -> Vec<usize> {
-    let residuals = list.iter().enumerate().filter_map(|(k, m)| Some((m.rough?.residual, k)));
-    best(list, residuals, ROUGHLY, scale)
-}
-
-/// Those of them to refine.
-fn coarsely_best(list: &[Match], places: &[usize], scale: f64) -> Vec<usize> {
-    let residuals = places.iter().filter_map(|k| Some((list[*k].coarse?.residual, *k)));
-    best(list, residuals, COARSELY, scale)
-}
-
-/// Fits what has to be fitted in a mouth's list and isn't yet, and gives the places and fits that stand: refined where
-/// the coarse one is good enough. Which these are depends on the list alone, not on what was fitted while it was another.
-fn refine(
-    list: &mut [Match],
-    mouth: &Segment,
-    outlines: &[&Outline],
-    (scale, free): (f64, bool),
-    feet: &mut placement::Feet,
-) -> Vec<(usize, placement::Fit)> {
-    let tab = |m: &Match| &outlines[m.hit.piece as usize].tabs[m.hit.tab as usize];
-    let places = roughly_best(list, scale);
-    for &place in &places {
-        let m = &mut list[place];
-        if let (Some(rough), None) = (&m.rough, &m.coarse) {
-            m.coarse = placement::coarse(tab(m), mouth, rough, scale, free, feet);
-        }
-    }
-    let fine = coarsely_best(list, &places, scale);
-    for &place in &fine {
-        let m = &mut list[place];
-        if let (Some(coarse), None) = (&m.coarse, &m.fine) {
-            let from = (&coarse.negative_from_positive, coarse.clearance);
-            m.fine = placement::refine(tab(m), mouth, from, scale, free, feet);
-        }
-    }
-    let fit = |k: usize| if fine.contains(&k) { list[k].fine } else { list[k].coarse };
-    places.into_iter().filter_map(|k| Some((k, fit(k)?))).collect()
-}
-
 /// A mean residual above this part of the cap means that the borders don't follow each other at all.
 const HOPELESS: f64 = 0.5;
 
@@ -712,11 +628,6 @@ const HOPELESS: f64 = 0.5;
 fn correlation_of(tab: &Segment, mouth: &Segment) -> f64 {
     let samples = |s: &Segment| s.shape.iter().map(|v| f64::from(*v)).collect::<Vec<f64>>();
     correlate(&samples(tab), &samples(mouth), 0.75, 8).value
-}
-
-fn windows(outline: &Outline) -> Windows {
-    let (w, p) = (OPENING_WINDOW * outline.scale, PATH_WINDOW * outline.scale);
-    Windows { opening: (-w, w), path: (-p, p) }
 }
 
 /// Assembles a whole set of pieces at once; indices in the result point into `pieces`.

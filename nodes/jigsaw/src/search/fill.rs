@@ -22,6 +22,7 @@ use crate::posegraph::{Factor, minimise};
 use isthmus::Point;
 use nalgebra::{Isometry2, Matrix6, Vector2, Vector6};
 use rayon::prelude::*;
+use std::collections::HashMap;
 
 /// Border farther than this from any other, in piece scales, lies open and says nothing.
 const NEAR: f64 = 0.12;
@@ -35,6 +36,8 @@ const FOLLOWS: f64 = 0.9;
 const LEAST_SHARE: f64 = 0.4;
 /// Two poses whose centroids are nearer than this, in piece scales, claim the same place.
 const SAME_PLACE: f64 = 0.3;
+/// Two poses that differ by more than this, in radians, are different ways to lie in a place.
+const TURN: f64 = 0.5;
 /// Adjustments until a pose has settled.
 const ROUNDS: usize = 4;
 /// Pieces are strained by about so much: flatbed scanners measure one axis 0.6 % longer, card swells, rows of a scan are
@@ -52,6 +55,8 @@ const COSTS: usize = 48;
 const BEST: usize = 2;
 /// A piece whose cost is this many deviations above that of placed ones fits like none of them.
 const UNLIKE: f64 = 4.0;
+/// An island of so many pieces shows by itself how pieces fit in it.
+const MANY: usize = 24;
 /// Fewer figures don't show how they spread.
 const FEW: usize = 4;
 /// Strangers fit worse by this much (natural logarithm) if all overlap.
@@ -96,7 +101,7 @@ struct Trial {
     pose: Isometry2<f64>,
     centre: Point,
     misfit: Misfit,
-    /// Candidates by which a place was looked for, for this piece.
+    /// Poses in which this piece was tried.
     tries: usize,
 }
 
@@ -110,6 +115,9 @@ struct Fitting {
     /// How enclosed those were that do, and what they cost; by the former.
     costs: Vec<(f64, f64)>,
 }
+
+/// What is known of islands, and of all of them together.
+type Learnt = HashMap<Option<usize>, Option<Fitting>>;
 
 impl Fitting {
     /// Logarithm of the odds that a piece belongs where it is tried: how much likelier its cost is for a piece that is
@@ -177,8 +185,8 @@ impl Assembler<'_> {
     /// Places pieces left over. Islands that are small beside the largest and whose candidates contradict (strained pieces
     /// are off by more than others) are then taken apart and laid down piece by piece, if all find a place so.
     pub(super) fn fill(&mut self) {
-        let mut fitting = None;
-        self.fill_alone(&mut fitting);
+        let mut fittings = Learnt::new();
+        self.fill_alone(&mut fittings);
         let most = self.state.largest() / STRAY_SHARE;
         let mut small: Vec<usize> =
             self.state.islands().filter(|k| (2..=most).contains(&self.state.size(*k))).collect();
@@ -192,7 +200,7 @@ impl Assembler<'_> {
             let saved = self.state.clone();
             let members: Vec<usize> = self.state.members(island).collect();
             self.detach(&members, &[]);
-            self.fill_alone(&mut fitting);
+            self.fill_alone(&mut fittings);
             if members.into_iter().any(|k| self.state.alone(k)) {
                 self.state = saved;
                 self.backtracks += 1;
@@ -202,29 +210,30 @@ impl Assembler<'_> {
 
     /// Places single pieces, the best fitting first, as long as some fit like those that are placed. How these do is learnt
     /// where it is not known yet.
-    fn fill_alone(&mut self, learnt: &mut Option<Fitting>) {
+    fn fill_alone(&mut self, learnt: &mut Learnt) {
         while !self.late() {
             let trials = self.trials();
             if trials.is_empty() {
                 return;
             }
-            if learnt.is_none() {
-                *learnt = self.fitting();
+            for t in &trials {
+                let of = self.fits_like(t.island);
+                learnt.entry(of).or_insert_with(|| self.fitting(of));
             }
-            let Some(fitting) = learnt else { return };
-            let sure = |t: &Trial| {
-                let evidence = fitting.evidence(t);
-                let rivals = trials.iter().filter(|o| (o.piece == t.piece) != self.same_place(o, t));
-                let lead = rivals.map(|o| evidence - fitting.evidence(o)).fold(f64::INFINITY, f64::min);
-                (evidence.min(lead) >= FOUND).then_some((evidence, *t))
+            let evidences: Vec<f64> = trials.iter().map(|t| self.evidence(learnt, t)).collect();
+            let sure = |(t, evidence): (&Trial, &f64)| {
+                let others = trials.iter().zip(&evidences);
+                let rivals = others.filter(|(o, _)| (o.piece == t.piece) != self.same_place(o, t));
+                let lead = rivals.map(|(_, other)| evidence - other).fold(f64::INFINITY, f64::min);
+                (evidence.min(lead) >= FOUND).then_some((*evidence, *t))
             };
-            let mut sure: Vec<(f64, Trial)> = trials.iter().filter_map(sure).collect();
+            let mut sure: Vec<(f64, Trial)> = trials.iter().zip(&evidences).filter_map(sure).collect();
             sure.sort_by(|p, q| q.0.total_cmp(&p.0).then(p.1.edge.cmp(&q.1.edge)));
             let mut islands: Vec<usize> = Vec::new();
             for (_, t) in sure {
                 // What has been placed beside it meanwhile has a say.
-                let now = self.trial(t.edge, t.piece, None).filter(|now| now.misfit.overlap <= self.tolerated());
-                let now = now.map(|now| Trial { tries: t.tries, ..now }).map(|now| (fitting.evidence(&now), now));
+                let now = self.trial(t.edge, t.piece, None).filter(|now| now.misfit.overlap <= self.tolerated_here());
+                let now = now.map(|now| Trial { tries: t.tries, ..now }).map(|now| (self.evidence(learnt, &now), now));
                 let Some((evidence, now)) = now.filter(|now| now.0 >= FOUND && self.free(t.edge)) else { continue };
                 self.place(&now, evidence);
                 islands.push(now.island);
@@ -239,6 +248,17 @@ impl Assembler<'_> {
                 islands.into_iter().for_each(|island| self.adjust(island, COARSE));
             }
         }
+    }
+
+    /// Logarithm of the odds that a piece belongs where it is tried, given how others fit there.
+    fn evidence(&self, learnt: &Learnt, trial: &Trial) -> f64 {
+        let fitting = learnt.get(&self.fits_like(trial.island)).and_then(Option::as_ref);
+        fitting.map_or(f64::NEG_INFINITY, |fitting| fitting.evidence(trial))
+    }
+
+    /// Overlap that is tolerated: what is strained sticks out by so much more on one side.
+    fn tolerated_here(&self) -> f64 {
+        self.tolerated() + STRAIN
     }
 
     fn same_place(&self, p: &Trial, q: &Trial) -> bool {
@@ -264,18 +284,22 @@ impl Assembler<'_> {
             .filter(|k| self.state.alone(self.edges[*k].a) != self.state.alone(self.edges[*k].b) && self.free(*k))
             .map(|k| (k, if self.state.alone(self.edges[k].a) { self.edges[k].a } else { self.edges[k].b }))
             .collect();
-        let mut tries = vec![0; self.outlines.len()];
-        edges.iter().for_each(|(_, piece)| tries[*piece] += 1);
-        let tried = edges.par_iter().filter_map(|(k, piece)| self.trial(*k, *piece, None));
-        let tried = tried.filter(|t| t.misfit.overlap <= self.tolerated());
-        let mut trials: Vec<Trial> = tried.map(|t| Trial { tries: tries[t.piece], ..t }).collect();
+        let mut trials: Vec<Trial> = edges.par_iter().filter_map(|(k, piece)| self.trial(*k, *piece, None)).collect();
         trials.sort_by(|p, q| {
             p.piece.cmp(&q.piece).then(p.misfit.cost.total_cmp(&q.misfit.cost)).then(p.edge.cmp(&q.edge))
         });
         let mut kept: Vec<Trial> = Vec::new();
-        for t in trials {
-            if !kept.iter().rev().take_while(|o| o.piece == t.piece).any(|o| self.same_place(o, &t)) {
-                kept.push(t);
+        for of_piece in trials.chunk_by(|p, q| p.piece == q.piece) {
+            // Several candidates may lead to one pose: that is one try, whether it overlaps or not.
+            let turned = |p: &Trial, q: &Trial| p.pose.rotation.angle_to(&q.pose.rotation).abs() > TURN;
+            let is_new =
+                |(i, t): &(usize, &Trial)| !of_piece[..*i].iter().any(|o| self.same_place(o, t) && !turned(o, t));
+            let tries = of_piece.iter().enumerate().filter(is_new).count();
+            let first = kept.len();
+            for t in of_piece.iter().filter(|t| t.misfit.overlap <= self.tolerated_here()) {
+                if !kept[first..].iter().any(|o| self.same_place(o, t)) {
+                    kept.push(Trial { tries, ..*t });
+                }
             }
         }
         kept
@@ -367,12 +391,19 @@ impl Assembler<'_> {
         Some(Misfit { cost: (sum / gaps.len() as f64).max(1e-4).ln(), share, overlap })
     }
 
-    /// How badly pieces fit that are placed, and how badly strangers in their places; `None` where there is nothing to
-    /// learn from.
-    fn fitting(&self) -> Option<Fitting> {
+    /// The pieces by which it is judged how one fits in an island: those of the island if they are many enough (puzzles in
+    /// one heap may be cut and pictured differently), or all.
+    fn fits_like(&self, island: usize) -> Option<usize> {
+        (self.state.size(island) >= MANY).then(|| self.state.island(island))
+    }
+
+    /// How badly pieces fit that are placed, in an island or anywhere, and how badly strangers in their places; `None`
+    /// where there is nothing to learn from.
+    fn fitting(&self, island: Option<usize>) -> Option<Fitting> {
         /// Nine tenths of a normal distribution lie below its mean and this many deviations.
         const NORMAL_90: f64 = 1.2816;
-        let placed: Vec<usize> = (0..self.outlines.len()).filter(|k| self.state.size(*k) > FEW).collect();
+        let counts = |k: usize| self.state.size(k) > FEW && island.is_none_or(|island| self.state.island(k) == island);
+        let placed: Vec<usize> = (0..self.outlines.len()).filter(|k| counts(*k)).collect();
         let sample: Vec<usize> = placed.iter().copied().step_by(placed.len().div_ceil(SAMPLE).max(1)).collect();
         let cost = |k: &usize| {
             Some(self.misfit(*k, Place { island: self.state.island(*k), away: None }, &self.state.pose[*k])?.cost)
@@ -398,7 +429,7 @@ impl Assembler<'_> {
                 others.filter(|(_, stranger, ..)| !self.aside[*stranger])
             })
         };
-        let large = self.state.joined().iter().filter(|k| self.state.size(self.edges[**k].a) > FEW);
+        let large = self.state.joined().iter().filter(|k| counts(self.edges[**k].a));
         let exchanges: Vec<(usize, usize, usize, usize)> = large.flat_map(instead).collect();
         let some: Vec<_> = exchanges.iter().step_by(exchanges.len().div_ceil(STRANGERS).max(1)).collect();
         let tried = some.par_iter().enumerate().filter_map(|(n, (k, stranger, held, piece))| {
@@ -407,7 +438,7 @@ impl Assembler<'_> {
         });
         let mut tried: Vec<Misfit> = tried.collect();
         tried.sort_by(|p, q| p.share.total_cmp(&q.share).then(p.cost.total_cmp(&q.cost)));
-        let fits = |m: &Misfit| m.overlap <= self.tolerated();
+        let fits = |m: &Misfit| m.overlap <= self.tolerated_here();
         let strangers = tried.iter().map(|m| (m.share, fits(m))).collect();
         let costs = tried.iter().filter(|m| fits(m)).map(|m| (m.share, m.cost)).collect();
         Some(Fitting { right, strangers, costs })

@@ -8,6 +8,7 @@
 
 use super::Assembler;
 use crate::loops::{self, Closure, Edge, Tolerance};
+use crate::placement::Joint;
 use crate::slots::{Slot, Slots};
 
 /// Loops of refined poses close to within this on real pieces (0.8 % and 0.44° measured); calibration tightens it.
@@ -142,10 +143,21 @@ impl Assembler<'_> {
         // Small sets measure the deviation badly, and clearances may differ from cut to cut.
         self.prior.mean = mean;
         self.prior.deviation = deviation.max(0.002 * self.scale);
-        for (k, e) in self.edges.iter_mut().enumerate() {
-            let z = (self.joints[k].fit.clearance - mean) / self.prior.deviation;
-            e.cost = self.joints[k].fit.residual.max(1e-4).ln() + 0.06 * (z * z).min(9.0);
+        self.calibrated = true;
+        let costs: Vec<f64> = self.joints.iter().map(|j| self.cost(j)).collect();
+        for (e, cost) in self.edges.iter_mut().zip(costs) {
+            e.cost = cost;
         }
+    }
+
+    /// What a candidate costs: its residual and, once that is known for this puzzle, how unusual its clearance is.
+    pub(super) fn cost(&self, joint: &Joint) -> f64 {
+        /// Clearances vary from cut to cut, so one that is three deviations off costs no more than a residual half as large
+        /// again.
+        const UNUSUAL: f64 = 0.06;
+        const MOST: f64 = 9.0;
+        let z = (joint.fit.clearance - self.prior.mean) / self.prior.deviation;
+        joint.fit.residual.max(1e-4).ln() + if self.calibrated { UNUSUAL * (z * z).min(MOST) } else { 0.0 }
     }
 
     /// Learns what right and wrong candidates cost: right ones are those `trusted`, wrong ones the best others of

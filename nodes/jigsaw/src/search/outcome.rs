@@ -35,7 +35,7 @@ impl Assembler<'_> {
             outcome = self.finish();
         }
         outcome.matings.retain(|m| m.confidence >= least);
-        outcome.contacts = self.contacts;
+        outcome.brought_up = self.joints.len() - self.given;
         outcome.joints = std::mem::take(&mut self.joints);
         outcome
     }

@@ -1,0 +1,80 @@
+//! A second look: candidates among the isthmuses that are still open.
+//!
+//! The index keeps the tabs that resemble a mouth most. In a large heap of worn pieces the right one may not be among
+//! them, or may have been outshone by one that has found its place since. Where little is left open few pairs remain, and
+//! each mouth is compared with many times as many of the tabs that are open as well. Complexity O(open mouths · tabs tried)
+//! rough poses, limited by [`TRIES`].
+
+use super::learn::rank;
+use super::{Assembler, edge};
+use crate::index::{Entry, Index, Windows};
+use crate::loops::Edge;
+use crate::matching::{self, Match};
+use crate::placement::{Feet, Joint};
+use crate::slots::Slot;
+use rayon::prelude::*;
+use std::collections::HashSet;
+
+/// Tabs tried for each mouth, in what the index keeps otherwise.
+const WIDER: usize = 8;
+/// Rough poses in all, about: some 30 ms of one core. Where so much is open that each mouth's share is no more than what
+/// the index keeps, a second look shows nothing new.
+const TRIES: usize = 20_000;
+
+impl Assembler<'_> {
+    /// Adds candidates between open isthmuses of different islands; tells whether there are any.
+    pub(super) fn widen(&mut self) -> bool {
+        let open = |s: &Slot| self.slots.rivals(*s).iter().all(|rival| self.state.mating_at(*rival).is_none());
+        let waiting = (0..self.outlines.len()).filter(|k| !self.aside[*k]);
+        let (mut tabs, mut mouths) = (Vec::new(), Vec::new());
+        for piece in waiting {
+            let outline = self.outlines[piece];
+            tabs.extend(
+                outline
+                    .tabs
+                    .iter()
+                    .enumerate()
+                    .filter(|(k, _)| open(&self.slots.tab(piece, *k)))
+                    .map(|(tab, segment)| Entry { piece: piece as u32, tab: tab as u32, rank: piece as u32, segment }),
+            );
+            let some = (0..outline.mouths.len()).filter(|k| open(&self.slots.mouth(piece, *k)));
+            mouths.extend(some.map(|mouth| (piece, mouth)));
+        }
+        let most = (TRIES / mouths.len().max(1)).min(WIDER * self.params.candidates);
+        if most <= self.params.candidates {
+            return false;
+        }
+        let index = Index::new(tabs);
+        let known: HashSet<[Slot; 2]> = self.edges.iter().map(|e| e.slots).collect();
+        let found: Vec<Vec<Joint>> = mouths
+            .into_par_iter()
+            .map_init(Feet::default, |feet, (b, mouth)| {
+                let (outline, segment) = (self.outlines[b], &self.outlines[b].mouths[mouth]);
+                let fit = (outline.scale, self.params.fit_clearance);
+                let mut hits = index.nearest(segment, b as u32, &Windows::of(outline), most);
+                hits.retain(|hit| {
+                    let (a, tab) = (hit.piece as usize, hit.tab as usize);
+                    let pair = [self.slots.tab(a, tab), self.slots.mouth(b, mouth)];
+                    self.state.island(a) != self.state.island(b) && !known.contains(&pair)
+                });
+                let mut list: Vec<Match> =
+                    hits.into_iter().map(|hit| Match::new(hit, segment, self.outlines, fit, feet)).collect();
+                let fits = matching::refine(&mut list, segment, self.outlines, fit, feet);
+                let joint = |(place, fit): (usize, _)| {
+                    let hit = &list[place].hit;
+                    Joint { a: hit.piece as usize, tab: hit.tab as usize, b, mouth, fit }
+                };
+                fits.into_iter().map(joint).collect()
+            })
+            .collect();
+        let before = self.edges.len();
+        for joint in found.into_iter().flatten() {
+            self.at[joint.a].push(self.edges.len());
+            self.at[joint.b].push(self.edges.len());
+            self.edges.push(Edge { cost: self.cost(&joint), ..edge(&joint, self.outlines, &self.slots) });
+            self.joints.push(joint);
+        }
+        rank(&mut self.edges, &self.slots);
+        self.edges.len() > before
+    }
+}
