@@ -33,7 +33,7 @@ impl Raw<'_> {
     /// Grey level between the pixels of a picture, which is continued by its outermost pixels.
     pub(super) fn between(&self, p: Point) -> f64 {
         let (x, y) = (p.x.clamp(0.0, (self.width - 1) as f64), p.y.clamp(0.0, (self.height - 1) as f64));
-        let (i, j) = (x as usize, y as usize);
+        let (i, j) = (x as u32 as usize, y as u32 as usize);
         let (u, v) = (x - i as f64, y - j as f64);
         let (i1, j1) = ((i + 1).min(self.width - 1), (j + 1).min(self.height - 1));
         let at = |x: usize, y: usize| f64::from(self.pixels[y * self.width + x]);

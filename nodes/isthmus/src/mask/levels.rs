@@ -347,7 +347,7 @@ impl Levels {
         let (row, column) = (in_blocks(y, block) - self.top as f64, in_blocks(from, block) - self.left as f64);
         let light = light.along(row, column, 1.0 / block as f64);
         let least = LEAST_LIGHT * self.contrast;
-        move |i| light.at(i).max(least)
+        move |i| larger(light.at(i), least)
     }
 
     /// Fills a row of pixels with their difference from the ground, divided by the local contrast unless that is uniform.
@@ -401,7 +401,14 @@ fn rounded(level: f32) -> u8 {
     /// Floating point numbers of this size have no fraction: added to it, a number from 0 to 255 is rounded, and its whole part is the lowest
     /// byte.
     const WHOLE: f32 = 8_388_608.0;
-    (level.clamp(0.0, 255.0) + WHOLE).to_bits() as u8
+    let positive = larger(level, 0.0);
+    let within = if positive < 255.0 { positive } else { 255.0 };
+    (within + WHOLE).to_bits() as u8
+}
+
+/// The larger of two numbers in one instruction of the processor: `f32::max` takes more, lest one is not a number.
+fn larger(a: f32, b: f32) -> f32 {
+    if a > b { a } else { b }
 }
 
 /// Where the pixels of a row come from.
