@@ -245,26 +245,19 @@ fn blur_along_row(line: &[u16], weights: &[u16], blurred: &mut Vec<[u16; CELL]>)
     let reach = weights.len() - 1;
     blurred.clear();
     for at in (reach..line.len() - reach).step_by(CELL) {
-        let centre = cell_at(line, at);
-        let mut sum = [0u16; CELL];
-        for i in 0..CELL {
-            sum[i] = scaled(centre[i], weights[0]);
+        let (left, right) = (&line[at - reach..at + CELL - 1], &line[at + 1..at + reach + CELL]);
+        let mut sums = [0u16; CELL];
+        for (sum, level) in sums.iter_mut().zip(&line[at..]) {
+            *sum = scaled(*level, weights[0]);
         }
-        for (offset, &weight) in weights.iter().enumerate().skip(1) {
-            let (left, right) = (cell_at(line, at - offset), cell_at(line, at + offset));
+        let pairs = left.array_windows::<CELL>().rev().zip(right.array_windows::<CELL>());
+        for (&weight, (left, right)) in weights[1..].iter().zip(pairs) {
             for i in 0..CELL {
-                sum[i] += scaled(left[i] + right[i], weight);
+                sums[i] += scaled(left[i] + right[i], weight);
             }
         }
-        blurred.push(sum);
+        blurred.push(sums);
     }
-}
-
-/// A cell's width of a line.
-fn cell_at(line: &[u16], from: usize) -> [u16; CELL] {
-    let mut cell = [0; CELL];
-    cell.copy_from_slice(&line[from..from + CELL]);
-    cell
 }
 
 /// Weights of a Gaussian kernel, the middle one and those to either side of it, in parts of 2^16.

@@ -101,15 +101,14 @@ impl Filter {
             unrolled.resize(n.next_multiple_of(BLOCK) + 2 * reach, 0.0);
             for (block, out) in filtered.chunks_mut(BLOCK).enumerate() {
                 // Weight by weight, some points at a time: their sums stay in registers.
-                let at = |shift: usize| {
-                    let mut values = [0.0; BLOCK];
-                    values.copy_from_slice(&unrolled[block * BLOCK + shift..][..BLOCK]);
-                    values
-                };
-                let mut sums = at(reach);
-                sums.iter_mut().for_each(|sum| *sum *= weights[0]);
-                for (j, weight) in weights.iter().enumerate().skip(1) {
-                    let (before, after) = (at(reach - j), at(reach + j));
+                let needed = &unrolled[block * BLOCK..][..2 * reach + BLOCK];
+                let (before, after) = (&needed[..reach + BLOCK - 1], &needed[reach + 1..]);
+                let mut sums = [0.0; BLOCK];
+                for (sum, value) in sums.iter_mut().zip(&needed[reach..]) {
+                    *sum = value * weights[0];
+                }
+                let pairs = before.array_windows::<BLOCK>().rev().zip(after.array_windows::<BLOCK>());
+                for (weight, (before, after)) in weights[1..].iter().zip(pairs) {
                     for i in 0..BLOCK {
                         sums[i] += (before[i] + after[i]) * weight;
                     }
