@@ -250,7 +250,7 @@ fn blur_along_row(line: &[u16], weights: &[u16], blurred: &mut Vec<[u16; CELL]>)
         for (sum, level) in sums.iter_mut().zip(&line[at..]) {
             *sum = scaled(*level, weights[0]);
         }
-        let pairs = left.array_windows::<CELL>().rev().zip(right.array_windows::<CELL>());
+        let pairs = left.windows(CELL).rev().zip(right.windows(CELL));
         for (&weight, (left, right)) in weights[1..].iter().zip(pairs) {
             for i in 0..CELL {
                 sums[i] += scaled(left[i] + right[i], weight);

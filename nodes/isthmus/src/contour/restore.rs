@@ -107,7 +107,7 @@ impl Filter {
                 for (sum, value) in sums.iter_mut().zip(&needed[reach..]) {
                     *sum = value * weights[0];
                 }
-                let pairs = before.array_windows::<BLOCK>().rev().zip(after.array_windows::<BLOCK>());
+                let pairs = before.windows(BLOCK).rev().zip(after.windows(BLOCK));
                 for (weight, (before, after)) in weights[1..].iter().zip(pairs) {
                     for i in 0..BLOCK {
                         sums[i] += (before[i] + after[i]) * weight;
