@@ -18,6 +18,7 @@
 //! | [`raw`] | topics whose type is known by name only |
 //! | [`session`] | one node: opens topics and services as streams and sinks |
 //! | [`peers`] | discovery without multicast |
+//! | `farewell` | says that a process leaves |
 //! | `turn` | the processes of a host open their endpoints one after the other |
 //! | [`process`] | one process: signals, participant, watchdog, exit code |
 //! | [`logging`] | log lines to the console and `/rosout`, throttled warnings |
@@ -27,6 +28,7 @@
 pub mod actions;
 pub mod activity;
 pub mod args;
+mod farewell;
 pub mod health;
 pub mod lifecycle;
 pub mod logging;

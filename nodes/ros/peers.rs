@@ -23,7 +23,7 @@ use rustdds::GUID;
 use socket2::{Domain, Protocol, Socket, Type};
 
 /// Where participants announce themselves (RTPS 9.6.1.4.1).
-const DISCOVERY_GROUP: Ipv4Addr = Ipv4Addr::new(239, 255, 0, 1);
+pub(super) const DISCOVERY_GROUP: Ipv4Addr = Ipv4Addr::new(239, 255, 0, 1);
 
 /// Ports of the RTPS specification (9.6.1.1): base, gain of the domain, offsets of user multicast and of discovery
 /// unicast, gain of the participant.
@@ -75,6 +75,17 @@ const PARTICIPANT_DETECTOR: u32 = 1 << 1;
 /// Where the IPv4 address stands in a locator, behind kind, port and twelve zeros.
 const LOCATOR_ADDRESS: std::ops::Range<usize> = 20..24;
 
+/// The port of [`DISCOVERY_GROUP`] in a domain.
+pub(super) fn discovery_multicast(domain: u16) -> u16 {
+    PORT_BASE + DOMAIN_GAIN * domain
+}
+
+/// The ports on which the first participants of a host listen to discovery in a domain.
+pub(super) fn discovery_unicast(domain: u16) -> impl Iterator<Item = u16> + Clone {
+    let first = PORT_BASE + DOMAIN_GAIN * domain + UNICAST_OFFSET;
+    (0..PARTICIPANTS).map(move |k| first + PARTICIPANT_GAIN * k)
+}
+
 /// Hears the announcements made on this host. To be opened before the participant.
 #[derive(Debug)]
 pub struct Courier {
@@ -95,7 +106,7 @@ impl Courier {
         socket.set_reuse_address(true)?;
         #[cfg(unix)]
         socket.set_reuse_port(true)?;
-        let port = PORT_BASE + DOMAIN_GAIN * domain;
+        let port = discovery_multicast(domain);
         socket.bind(&SocketAddr::from((Ipv4Addr::UNSPECIFIED, port)).into())?;
         let joined = multicast_addresses(interfaces)
             .into_iter()
@@ -114,8 +125,7 @@ impl Courier {
     /// The system's, where no thread can be started.
     pub fn serve(self, participant: GUID, peers: Vec<Ipv4Addr>) -> std::io::Result<()> {
         let prefix = participant.to_bytes();
-        let first = PORT_BASE + DOMAIN_GAIN * self.domain + UNICAST_OFFSET;
-        let ports = (0..PARTICIPANTS).map(move |k| first + PARTICIPANT_GAIN * k);
+        let ports = discovery_unicast(self.domain);
         // This host hears the announcement itself.
         let own = multicast_addresses(&[]);
         let peers = peers.into_iter().filter(|peer| !own.contains(peer));
@@ -238,7 +248,7 @@ fn announcement_for_peers(body: &[u8]) -> Option<Vec<u8>> {
 }
 
 /// The IPv4 addresses among these, or those of all interfaces.
-fn multicast_addresses(given: &[IpAddr]) -> Vec<Ipv4Addr> {
+pub(super) fn multicast_addresses(given: &[IpAddr]) -> Vec<Ipv4Addr> {
     if !given.is_empty() {
         return given.iter().filter_map(|a| if let IpAddr::V4(a) = a { Some(*a) } else { None }).collect();
     }

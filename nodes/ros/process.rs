@@ -38,6 +38,7 @@ use rustdds::{DomainParticipant, DomainParticipantBuilder, RTPSEntity};
 
 use super::activity::Activity;
 use super::args::{ArgsError, RosArgs, domain_id};
+use super::farewell::Farewell;
 use super::health::Health;
 use super::params::{Default as DefaultValue, ParameterError, Parameters, Rule, Spec};
 use super::session::{Clock, Endpoints, Session, SessionError};
@@ -235,6 +236,8 @@ pub struct Process {
     participant: Option<(DomainParticipant, Context)>,
     /// Held until the endpoints are open.
     turn: Option<Turn>,
+    /// Said at the end.
+    farewell: Option<Farewell>,
     /// Where the work is told that a signal has come, if it wants to end itself.
     ending: Option<oneshot::Sender<()>>,
     /// The parameters of all nodes of a composed process: one that another node has is no mistake.
@@ -261,6 +264,7 @@ impl Process {
             endpoints: Endpoints::default(),
             participant: None,
             turn: None,
+            farewell: None,
             ending: None,
             tables: &[],
             started_again: false,
@@ -380,13 +384,23 @@ impl Process {
             }
         }));
         logging::remove_nodes();
+        let farewell = self.farewell.take();
+        let leave = || {
+            if let Some(Err(e)) = farewell.as_ref().map(Farewell::say) {
+                log::debug!("nobody was told of the end: {e}");
+            }
+        };
         if matches!(result, Err(ProcessError::Deaf(_))) {
             // A dead participant can't be taken down in order; its drop would wait for the dead thread.
+            leave();
             if let Err(error) = &result {
                 eprintln!("{}: {error}", self.name);
                 std::process::exit(i32::from(error.exit_code()));
             }
         }
+        // When nothing of it is left that could announce itself once more.
+        drop((executor, self));
+        leave();
         result
     }
 
@@ -403,9 +417,11 @@ impl Process {
             log::debug!("network interfaces: {addresses:?}");
             builder = builder.with_only_networks(addresses.iter().copied());
         }
+        let mut is_secured = false;
         if let Some(enclave) = security::enclave(self.args.enclave.as_deref(), |variable| std::env::var(variable).ok())?
         {
             builder = secured(builder, &enclave);
+            is_secured = true;
         }
         let peers = static_peers(parameters, std::env::var("ROS_STATIC_PEERS").ok())?;
         let system = |e: std::io::Error| ProcessError::System { what: "listening to discovery", reason: e.to_string() };
@@ -415,8 +431,9 @@ impl Process {
         let participant = builder.build().map_err(|e| SessionError::middleware(format!("DDS domain {domain}"), e))?;
         if let Some(courier) = courier {
             log::debug!("static peers: {peers:?}");
-            courier.serve(participant.guid(), peers).map_err(system)?;
+            courier.serve(participant.guid(), peers.clone()).map_err(system)?;
         }
+        self.farewell = (!is_secured).then(|| Farewell::of(participant.guid(), domain, addresses, peers));
         self.turn = Some(Turn::take(domain));
         let context = Context::from_domain_participant(participant.clone())
             .map_err(|e| SessionError::middleware(format!("DDS domain {domain}"), e))?;

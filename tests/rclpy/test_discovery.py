@@ -4,6 +4,7 @@ import pytest
 
 from conftest import Harness
 
+LEASE = 50.0  # seconds after which RustDDS wants its participants to be forgotten
 STARTS = 4  # nodes that don't take turns are seen whole in half of the starts
 
 PARAMETERS = {
@@ -56,6 +57,16 @@ def missing(node, name):
         | ((HEARD[name] | {"/clock"}) - names(node.get_subscriber_names_and_types_by_node(name, "/")))
         | ((SERVED[name] | private) - names(node.get_service_names_and_types_by_node(name, "/")))
     )
+
+
+def test_a_node_that_has_ended_is_forgotten_at_once(launcher, ros):
+    """Not only when its lease is over, after 50 s; so that nobody calls a service that is not there any more."""
+    node = ros.node("looker")
+    solver = launcher.start("solver_node")
+    ros.until(lambda: not missing(node, "solver_node"), "solver node")
+    solver.stop()
+    ros.until(lambda: not node.get_publishers_info_by_topic("/assembly"), "end of the publisher", LEASE / 2)
+    assert "solver_node" not in node.get_node_names()
 
 
 @pytest.mark.parametrize("start", range(STARTS))
