@@ -24,7 +24,7 @@ const IDF: usize = 64;
 fn one_piece(c: &mut Criterion) {
     let outline = Piece::usual(300.0).outline(&pose(0.3, 1.0, 512.0, 512.0));
     let camera = Camera { width: 1024, height: 1024, noise: 3.0, ..Camera::default() };
-    let pixels = camera.picture(&[outline]);
+    let pixels = camera.picture(std::slice::from_ref(&outline));
     let frame = Frame::grey(1024, 1024, &pixels).unwrap();
     let mut segmenter = Segmenter::default();
     let cutout = segmenter.segment(&frame, &Parameters::default()).cutouts.remove(0);
@@ -55,6 +55,17 @@ fn one_piece(c: &mut Criterion) {
             found.cutouts.iter().map(|c| extractor.extract(c).unwrap().isthmuses.len()).sum::<usize>()
         });
     });
+    for (noise, blur, vignette) in [(3.0, 1.0, 0.5), (20.0, 4.0, 0.0), (20.0, 4.0, 0.5)] {
+        let camera = Camera { noise, blur, vignette, ..camera };
+        let pixels = camera.picture(std::slice::from_ref(&outline));
+        let frame = Frame::grey(1024, 1024, &pixels).unwrap();
+        group.bench_function(format!("all of it, noise {noise}, blur {blur}, vignette {vignette}"), |b| {
+            b.iter(|| {
+                let found = segmenter.segment(black_box(&frame), &Parameters::default());
+                found.cutouts.iter().map(|c| extractor.extract(c).unwrap().isthmuses.len()).sum::<usize>()
+            });
+        });
+    }
     group.sample_size(10);
     let binary =
         GrayImage::from_fn(1024, 1024, |x, y| Luma([if pixels[(y * 1024 + x) as usize] < 128 { 255 } else { 0 }]));
