@@ -53,6 +53,8 @@ const ALIKE: usize = 100;
 const COSTS: usize = 48;
 /// ... by the best of them, one in so many: it is these that a wrong piece would be one of.
 const BEST: usize = 2;
+/// One in so many strangers may be the twin of the piece in whose place it is tried, and so no stranger there.
+const TWINS: usize = 20;
 /// A piece whose cost is this many deviations above that of placed ones fits like none of them.
 const UNLIKE: f64 = 4.0;
 /// An island of so many pieces shows by itself how pieces fit in it.
@@ -130,10 +132,21 @@ impl Fitting {
         let rarity = (strangers.len() + 1) as f64 / (strangers.iter().filter(|s| s.1).count() + 1) as f64;
         let mut costs: Vec<f64> = alike(&self.costs, trial.misfit.share, COSTS).iter().map(|s| s.1).collect();
         costs.sort_by(f64::total_cmp);
+        let near = self.nearness(trial.misfit.cost, &costs[costs.len() / TWINS..]);
         costs.truncate(costs.len().div_ceil(BEST));
         let wrong = if costs.len() < FEW { (self.right.0 + STRANGE, self.right.1) } else { spread_of(&mut costs) };
         let model = Model::between(self.right, wrong);
-        model.evidence(trial.misfit.cost) + rarity.ln() - (trial.tries.max(1) as f64).ln()
+        model.evidence(trial.misfit.cost).min(near) + rarity.ln() - (trial.tries.max(1) as f64).ln()
+    }
+
+    /// Logarithm of how much likelier a cost is for a piece that is placed than for one of the strangers as they are (kernel
+    /// density, Rosenblatt 1956): a few that nearly fit don't show in the middle and the spread of all.
+    fn nearness(&self, cost: f64, strangers: &[f64]) -> f64 {
+        let (middle, deviation) = self.right;
+        let cost = cost.max(middle);
+        let kernel = |centre: f64| (-0.5 * ((cost - centre) / deviation).powi(2)).exp();
+        let wrong = strangers.iter().map(|s| kernel(*s)).sum::<f64>() / strangers.len().max(1) as f64;
+        (kernel(middle) / wrong.max(f64::MIN_POSITIVE)).ln()
     }
 }
 
