@@ -358,6 +358,8 @@ pub(crate) struct Closure {
     chance: f64,
     /// How often two candidates agree by chance where two right ones would.
     rate: f64,
+    /// Logarithm of the odds that any of the loops are true.
+    any: f64,
 }
 
 impl Closure {
@@ -365,7 +367,7 @@ impl Closure {
     pub(crate) fn guess(narrow: f64, wide: f64) -> Self {
         /// The least that is believed of it: what decoys don't show they may just have missed.
         const RATE: f64 = 0.01;
-        Self { narrow, right: 0.0, wide: wide.max(LEAST_RATIO * narrow), chance: 1.0, rate: RATE }
+        Self { narrow, right: 0.0, wide: wide.max(LEAST_RATIO * narrow), chance: 1.0, rate: RATE, any: f64::INFINITY }
     }
 
     /// Fits the two distributions to the loops found (maximum posterior over a grid of both scales; the counts by
@@ -382,6 +384,8 @@ impl Closure {
         /// Expectation and maximisation of the counts, until they change by less than this part of all.
         const STEPS: usize = 12;
         const SETTLED: f64 = 1e-3;
+        /// A heap of pieces has true loops, before anything is seen: the natural logarithm of the odds.
+        const HEAP: f64 = 3.0;
         /// Loops that are looked at: more don't make the scales surer.
         const LOOPS: usize = 150;
         let sets = if decoys.sets > 0.0 { decoys.sets } else { 1.0 };
@@ -407,6 +411,14 @@ impl Closure {
         if distances.is_empty() {
             return best.1;
         }
+        let prior = |scale: f64, expected: f64, deviation: f64| 0.5 * ((scale / expected).ln() / deviation).powi(2);
+        // All of them by chance: as many as both the decoys and the loops themselves say.
+        let all = 0.5 * (distances.len() as f64 + expected * share);
+        let by_chance = |(wide, densities): &(f64, Vec<f64>)| {
+            let sum: f64 = densities.iter().map(|g| (all * g).max(f64::MIN_POSITIVE).ln()).sum();
+            sum - all - prior(*wide, decoy_wide, DECOY_DEVIATION)
+        };
+        let by_chance = wides.iter().map(by_chance).fold(f64::NEG_INFINITY, f64::max);
         for narrow in scales(guess.narrow * (-2.0 * GUESS_DEVIATION).exp(), decoy_wide * reach / LEAST_RATIO) {
             let right_densities = densities(narrow);
             for (wide, chance_densities) in wides.iter().filter(|w| w.0 >= LEAST_RATIO * narrow) {
@@ -425,17 +437,16 @@ impl Closure {
                         break;
                     }
                 }
-                let off =
-                    |scale: f64, expected: f64, deviation: f64| 0.5 * ((scale / expected).ln() / deviation).powi(2);
                 let sum: f64 = densities().map(|d| both(right, chance, d).1.ln()).sum();
                 let value = sum
                     - right
                     - chance
-                    - off(narrow, guess.narrow, GUESS_DEVIATION)
-                    - off(*wide, decoy_wide, DECOY_DEVIATION);
+                    - prior(narrow, guess.narrow, GUESS_DEVIATION)
+                    - prior(*wide, decoy_wide, DECOY_DEVIATION);
                 if value > best.0 {
-                    let found = Self { narrow, right: right / share, wide: *wide, chance: chance / share, rate };
-                    best = (value, found);
+                    let any = value - by_chance + HEAP;
+                    best =
+                        (value, Self { narrow, right: right / share, wide: *wide, chance: chance / share, rate, any });
                 }
             }
         }
@@ -444,7 +455,9 @@ impl Closure {
 
     /// Logarithm of the odds that a loop which fails to close by `distance` is right.
     pub(crate) fn evidence(&self, distance: f64) -> f64 {
-        self.ratio(distance, self.narrow) + (self.right.max(f64::MIN_POSITIVE) / self.chance).ln()
+        let this = self.ratio(distance, self.narrow) + (self.right.max(f64::MIN_POSITIVE) / self.chance).ln();
+        // No loop is surer than that there are true ones.
+        this.min(self.any)
     }
 
     /// Logarithm of how much likelier two candidates disagree by no more than `distance` if both are right than by
