@@ -178,7 +178,7 @@ impl<'a> Ways<'a> {
         /// Sets of decoys at most: a few pieces have too few ways to show what chance does.
         const SETS: u64 = 3;
         /// Ways tried at most, about: more don't make chance better known.
-        const TRIES: f64 = 25_000.0;
+        const TRIES: f64 = 12_000.0;
         let n = self.outlines.len();
         let doors = [false, true].map(|tabs| (0..n).flat_map(|k| self.slots.of(k, tabs)).collect::<Vec<Slot>>());
         // Of the ways from each piece about half lead to pieces of higher rank.

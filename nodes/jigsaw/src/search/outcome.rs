@@ -9,7 +9,7 @@ use super::{Assembler, Mated, Outcome, edge};
 use crate::Policy;
 use crate::placement::{self, Joint};
 use crate::slots::Slot;
-use std::collections::{HashMap, HashSet};
+use std::collections::HashMap;
 
 /// An island of at most so many pieces is stray if the largest is this many times as large: pieces that lie face down
 /// or twice may well mate with one another, but where they belong is taken. Halves of mixed puzzles are larger.
@@ -45,14 +45,18 @@ impl Assembler<'_> {
     pub(super) fn add_contacts(&mut self) {
         /// Isthmus points of a tab and of its mouth are no farther apart, in piece scales: flat minima slide along the neck.
         const NEAR: f64 = 0.15;
-        let agreeing = self.edges.iter().enumerate().filter(|(k, _)| self.same_island(*k) && self.agrees(*k));
-        let mut settled: HashSet<Slot> = agreeing.flat_map(|(_, e)| e.slots).collect();
+        let mut settled = vec![false; self.slots.count()];
+        for (_, e) in self.edges.iter().enumerate().filter(|(k, _)| self.same_island(*k) && self.agrees(*k)) {
+            e.slots.into_iter().flat_map(|s| self.slots.rivals(s)).for_each(|s| settled[s.number] = true);
+        }
         let mut met: Vec<(f64, [usize; 2], [usize; 2])> = Vec::new();
         for (p, q) in self.state.islands().flat_map(|k| self.neighbours(k)) {
             for [a, b] in [[p, q], [q, p]] {
                 let b_from_a = self.state.pose[b].inverse() * self.state.pose[a];
-                for (tab, t) in self.outlines[a].tabs.iter().enumerate() {
-                    for (mouth, m) in self.outlines[b].mouths.iter().enumerate() {
+                let tabs = self.outlines[a].tabs.iter().enumerate();
+                for (tab, t) in tabs.filter(|(tab, _)| !settled[self.slots.tab(a, *tab).number]) {
+                    let mouths = self.outlines[b].mouths.iter().enumerate();
+                    for (mouth, m) in mouths.filter(|(mouth, _)| !settled[self.slots.mouth(b, *mouth).number]) {
                         met.push(((b_from_a * t.origin - m.origin).norm(), [a, tab], [b, mouth]));
                     }
                 }
@@ -63,7 +67,7 @@ impl Assembler<'_> {
         let mut feet = placement::Feet::default();
         for (_, [a, tab], [b, mouth]) in met {
             let ends = [self.slots.tab(a, tab), self.slots.mouth(b, mouth)];
-            if ends.iter().any(|s| self.slots.rivals(*s).iter().any(|rival| settled.contains(rival))) {
+            if ends.iter().any(|s| settled[s.number]) {
                 continue;
             }
             let b_from_a = self.state.pose[b].inverse() * self.state.pose[a];
@@ -73,7 +77,7 @@ impl Assembler<'_> {
             let Some(fit) = placement::refine(t, m, from, scale, self.params.fit_clearance, &mut feet) else {
                 continue;
             };
-            settled.extend(ends);
+            ends.into_iter().flat_map(|s| self.slots.rivals(s)).for_each(|s| settled[s.number] = true);
             let joint = Joint { a, tab, b, mouth, fit };
             self.edges.push(edge(&joint, self.outlines, &self.slots));
             self.joints.push(joint);
