@@ -1,5 +1,5 @@
 //! What two outlines in a given pose say about each other: by how much they overlap, and how one should move along the
-//! other. Both are remembered, for the same pairs lie side by side in the next solution.
+//! other. Both are remembered, for the same pairs lie side by side in the next solution; and so is Eq. 1 of those mated.
 //!
 //! *Contact*: the border of one piece is followed along that of the other (feet looked up on its distance raster);
 //! point-to-line normal equations with robust weights, as in [`crate::placement`], over motion and clearance.
@@ -67,6 +67,7 @@ struct Shard {
     /// Figures with the number of the solution that asked last.
     contacts: FxHashMap<Key, (u32, Option<Equations>)>,
     overlaps: FxHashMap<Key, (u32, f64)>,
+    correlations: FxHashMap<[(u64, usize); 2], (u32, f64)>,
 }
 
 /// Contacts and overlaps that have been computed.
@@ -84,8 +85,8 @@ impl Clone for Memory {
 }
 
 impl Memory {
-    fn shard(&self, key: &Key) -> std::sync::MutexGuard<'_, Shard> {
-        let sum = key.pieces[0].wrapping_mul(31).wrapping_add(key.pieces[1]) as usize;
+    fn shard(&self, pieces: [u64; 2]) -> std::sync::MutexGuard<'_, Shard> {
+        let sum = pieces[0].wrapping_mul(31).wrapping_add(pieces[1]) as usize;
         // What a panicking thread left behind are whole entries.
         self.shards[sum % SHARDS].lock().unwrap_or_else(PoisonError::into_inner)
     }
@@ -97,6 +98,7 @@ impl Memory {
             let shard = shard.get_mut().unwrap_or_else(PoisonError::into_inner);
             shard.contacts.retain(|_, v| v.0 == last);
             shard.overlaps.retain(|_, v| v.0 == last);
+            shard.correlations.retain(|_, v| v.0 == last);
         }
         self.solution = last.wrapping_add(1);
     }
@@ -109,13 +111,25 @@ impl Memory {
         }
         let rounded = Rounded::new(a, b_from_a, OVERLAP_MESH);
         let key = Key { pieces: [a.serial, b.serial], stride: 0, pose: rounded.place };
-        if let Some(known) = self.shard(&key).overlaps.get_mut(&key) {
+        if let Some(known) = self.shard(key.pieces).overlaps.get_mut(&key) {
             known.0 = self.solution;
             return known.1;
         }
         let area = overlap_area(a, b, &rounded.pose);
-        self.shard(&key).overlaps.insert(key, (self.solution, area));
+        self.shard(key.pieces).overlaps.insert(key, (self.solution, area));
         area
+    }
+
+    /// Eq. 1 of a tab and a mouth, each by the serial number of its piece and its place there.
+    pub(crate) fn correlation(&self, tab: (u64, usize), mouth: (u64, usize), compute: impl FnOnce() -> f64) -> f64 {
+        let pieces = [tab.0, mouth.0];
+        if let Some(known) = self.shard(pieces).correlations.get_mut(&[tab, mouth]) {
+            known.0 = self.solution;
+            return known.1;
+        }
+        let value = compute();
+        self.shard(pieces).correlations.insert([tab, mouth], (self.solution, value));
+        value
     }
 
     /// What two pieces within `band` piece scales of each other say about their pose, from a point each `step` scales.
@@ -130,13 +144,13 @@ impl Memory {
         let stride = ((a.scale * step / a.spacing) as usize).max(1);
         let rounded = Rounded::new(a, b_from_a, step / MESHES);
         let key = Key { pieces: [a.serial, b.serial], stride, pose: rounded.place };
-        let known = self.shard(&key).contacts.get_mut(&key).map(|known| {
+        let known = self.shard(key.pieces).contacts.get_mut(&key).map(|known| {
             known.0 = self.solution;
             known.1
         });
         let equations = known.unwrap_or_else(|| {
             let computed = follow(a, b, &rounded.pose, 0.5 * band * (a.scale + b.scale), stride);
-            self.shard(&key).contacts.insert(key, (self.solution, computed));
+            self.shard(key.pieces).contacts.insert(key, (self.solution, computed));
             computed
         })?;
         Some(equations.contact(&rounded.motion_to(b_from_a, &equations.centre), prior))

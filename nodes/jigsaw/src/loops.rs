@@ -384,6 +384,8 @@ impl Closure {
         /// Expectation and maximisation of the counts, until they change by less than this part of all.
         const STEPS: usize = 12;
         const SETTLED: f64 = 1e-3;
+        /// They grow from no less than this part, for from nothing they never would.
+        const LEAST: f64 = 0.05;
         /// A heap of pieces has true loops, before anything is seen: the natural logarithm of the odds.
         const HEAP: f64 = 3.0;
         /// Loops that are looked at: more don't make the scales surer.
@@ -421,8 +423,10 @@ impl Closure {
         let by_chance = wides.iter().map(by_chance).fold(f64::NEG_INFINITY, f64::max);
         for narrow in scales(guess.narrow * (-2.0 * GUESS_DEVIATION).exp(), decoy_wide * reach / LEAST_RATIO) {
             let right_densities = densities(narrow);
+            // Scales that are alike have counts that are: the next begin where the last have settled.
+            let (mut right, mut chance) = (0.5 * distances.len() as f64, expected * share);
             for (wide, chance_densities) in wides.iter().filter(|w| w.0 >= LEAST_RATIO * narrow) {
-                let (mut right, mut chance) = (0.5 * distances.len() as f64, expected * share);
+                right = right.max(LEAST * distances.len() as f64);
                 let densities = || right_densities.iter().zip(chance_densities);
                 let both = |right: f64, chance: f64, (f, g): (&f64, &f64)| {
                     (right * f, (right * f + chance * g).max(f64::MIN_POSITIVE))

@@ -86,8 +86,9 @@ struct Assembler<'a> {
     prior: ClearancePrior,
     /// Whether the clearance is known from this puzzle.
     calibrated: bool,
-    /// What true and false candidates cost.
+    /// What true and false candidates cost, and whether that is known from this puzzle.
     model: Model,
+    learnt: bool,
     /// How loops close.
     closure: Closure,
     /// Pieces that wait: copies of others, until those are placed.
@@ -140,6 +141,7 @@ pub(crate) fn assemble(
             right: ((1.5 * noise + 0.001 * scale).ln(), 0.4),
             wrong: ((1.5 * noise + 0.01 * scale).ln(), 0.5),
         },
+        learnt: false,
         closure: Closure::guess(0.02, 1.0),
         aside: vec![false; n],
         state: State::new(n, &slots),

@@ -305,7 +305,7 @@ impl Solver {
         let outlines = ranked(&self.kept, &order);
         let outcome = search::assemble(&outlines, joints, &self.params, &self.memory, budget);
         self.count_brought_up(&mut table, &order, &outlines, &outcome);
-        let mut assembly = report(&order, &outlines, &outcome);
+        let mut assembly = report(&order, &outlines, &outcome, &self.memory);
         assembly.table = TableCounts { backtracks: outcome.backtracks, ..table };
         assembly.partial = outcome.partial || !whole;
         assembly.timings =
@@ -514,7 +514,7 @@ fn hopeless(joint: &Joint, mouth: &Outline) -> bool {
 }
 
 /// Turns ranks into indices and lays the islands out.
-fn report(order: &[usize], outlines: &[&Outline], outcome: &Outcome) -> Assembly {
+fn report(order: &[usize], outlines: &[&Outline], outcome: &Outcome, memory: &Memory) -> Assembly {
     let mut islands: std::collections::BTreeMap<usize, Vec<usize>> = std::collections::BTreeMap::new();
     for (k, pose) in outcome.poses.iter().enumerate() {
         if let Some((island, _)) = pose {
@@ -547,7 +547,9 @@ fn report(order: &[usize], outlines: &[&Outline], outcome: &Outcome) -> Assembly
             positive_isthmus: tab.isthmus,
             negative_piece: order[j.b],
             negative_isthmus: mouth.isthmus,
-            correlation: correlation_of(tab, mouth),
+            correlation: memory.correlation((outlines[j.a].serial, j.tab), (outlines[j.b].serial, j.mouth), || {
+                correlation_of(tab, mouth)
+            }),
             ave_gap: j.fit.ave_gap,
             clearance: mated.clearance,
             confidence: mated.confidence,

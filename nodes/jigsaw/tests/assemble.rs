@@ -50,6 +50,33 @@ fn incomplete_and_mixed_heaps_make_no_wrong_mating() {
     }
 }
 
+/// What an arm is told while pieces still come in is as little wrong as what it is told in the end.
+#[test]
+fn nothing_is_wrong_on_the_way() {
+    for seed in 11..16 {
+        let options = Options {
+            seed,
+            noise: 8.0,
+            blur: 1.5,
+            clearance: [1.0, 1.0],
+            frame: Some([512, 512]),
+            ..Options::default()
+        };
+        let puzzle = Puzzle::generate(&options).expect("valid options");
+        let mut pieces = puzzle.seen().expect("a piece in each frame");
+        // Multiplied by a number that shares no factor with their count, the places are an order far from the rows.
+        let count = pieces.len();
+        pieces = (0..count).map(|k| pieces[(7 * k + seed as usize) % count].clone()).collect();
+        let mut solver = Solver::new(Params::default()).expect("valid parameters");
+        for piece in pieces {
+            solver.insert(piece).expect("unique ids");
+            let assembly = solver.solve();
+            let score = puzzle.score(solver.pieces(), &assembly);
+            assert_eq!((score.misplaced, score.wrong_matings), (0, 0), "seed {seed}: {score:?}");
+        }
+    }
+}
+
 /// Pieces that others hold in place mate with all their neighbours, whether the index thought so or not.
 #[test]
 fn a_contact_is_a_mating_even_if_it_was_no_candidate() {

@@ -6,7 +6,7 @@
 
 use super::Assembler;
 use super::adjust::COARSE;
-use super::learn::{ACCEPT, STRONG, WORN};
+use super::learn::{ACCEPT, STRONG, UNLEARNT, WORN};
 use crate::loops::{self, Said};
 use std::collections::BTreeMap;
 
@@ -73,8 +73,9 @@ impl Assembler<'_> {
                 grouped.insert(*k, self.group(i, low, &candidates, &said));
             }
         }
+        let least = if self.learnt { ACCEPT } else { UNLEARNT };
         // A candidate must be likely by itself, and lead whatever else would take its place.
-        let acceptable = grouped.values().filter(|g| g.evidence >= ACCEPT && self.lead(g, &grouped) >= ACCEPT);
+        let acceptable = grouped.values().filter(|g| g.evidence >= least && self.lead(g, &grouped) >= ACCEPT);
         acceptable.map(|g| (g.evidence, g.members.clone())).collect()
     }
 

@@ -53,6 +53,8 @@ pub(super) const STRONG: f64 = 12.0;
 pub(super) const AGREEMENT: f64 = 4.0;
 /// Evidence that a join must have: odds of twenty to one.
 pub(super) const ACCEPT: f64 = 3.0;
+/// The same while no joint has shown yet how this puzzle's joints fit: what borders of any puzzle would do says less.
+pub(super) const UNLEARNT: f64 = 6.0;
 /// Evidence that a loop must have, on which all else is built: odds of a hundred to one.
 pub(super) const FOUND: f64 = 4.5;
 /// Evidence below which a candidate is no mating, whatever supports it.
@@ -120,8 +122,10 @@ impl Assembler<'_> {
     /// Counts what supports what, leaves out loops that are more likely chance, and puts the best first.
     fn sorted(&mut self, found: Vec<loops::Loop>) -> Vec<loops::Loop> {
         let value = |l: &loops::Loop| {
-            let costs = l.edges.iter().map(|k| self.model.evidence(self.edges[*k].cost).max(WORN));
-            l.evidence + costs.sum::<f64>()
+            let costs = l.edges.iter().map(|k| self.model.evidence(self.edges[*k].cost));
+            // One worn joint doesn't refute a loop; several do, however good the others are: those may be right without it.
+            let worst = costs.clone().fold(f64::INFINITY, f64::min);
+            l.evidence + costs.sum::<f64>() - worst + worst.max(WORN)
         };
         let mut keyed: Vec<(f64, loops::Loop)> = found.into_iter().map(|l| (value(&l), l)).collect();
         keyed.retain(|(value, l)| *value >= FOUND && l.evidence >= 0.0);
@@ -178,6 +182,7 @@ impl Assembler<'_> {
             return;
         }
         self.model = Model::between(spread_of(&mut right), spread_of(&mut wrong));
+        self.learnt = true;
     }
 
     /// Before anything is trusted: right candidates cost what noise and sampling make them, wrong ones what the second
