@@ -131,11 +131,10 @@ def test_time_budget_takes_effect(ros, solved):
 def test_candidates_take_effect(ros, solved):
     arm, settings = solved
     many = arm.assemblies[-1].table
-    assembly = next_assembly(ros, arm, lambda: settings.set("candidates", 1), lambda a: a.table != many, "other table")
-    few = assembly.table
+    few = next_assembly(ros, arm, lambda: settings.set("candidates", 1), lambda a: a.table != many, "other table").table
     assert (few.positive, few.negative, few.pairs) == (many.positive, many.negative, many.pairs)
-    # One of each mouth, and contacts that the assembly showed beside them.
-    assert few.after_correlation <= few.negative + len(assembly.matings) < many.after_correlation
+    # One of each mouth, and what a second look at those left open brings up.
+    assert 0 < few.after_correlation < many.after_correlation
 
 
 def test_minimum_confidence_takes_effect(ros, solved):

@@ -121,14 +121,19 @@ impl Assembler<'_> {
 
     /// Counts what supports what, leaves out loops that are more likely chance, and puts the best first.
     fn sorted(&mut self, found: Vec<loops::Loop>) -> Vec<loops::Loop> {
-        let value = |l: &loops::Loop| {
-            let costs = l.edges.iter().map(|k| self.model.evidence(self.edges[*k].cost));
-            // One worn joint doesn't refute a loop; several do, however good the others are: those may be right without it.
-            let worst = costs.clone().fold(f64::INFINITY, f64::min);
-            l.evidence + costs.sum::<f64>() - worst + worst.max(WORN)
+        let costs = |l: &loops::Loop| -> Vec<f64> {
+            l.edges.iter().map(|k| self.model.evidence(self.edges[*k].cost)).collect()
         };
-        let mut keyed: Vec<(f64, loops::Loop)> = found.into_iter().map(|l| (value(&l), l)).collect();
-        keyed.retain(|(value, l)| *value >= FOUND && l.evidence >= 0.0);
+        // One worn joint doesn't refute a loop; several do, however good the others are: those may be right without it.
+        let believed = |l: &loops::Loop| {
+            let costs = costs(l);
+            let worst = costs.iter().copied().fold(f64::INFINITY, f64::min);
+            let all: f64 = costs.iter().map(|c| c.min(ACCEPT)).sum();
+            l.evidence >= 0.0 && l.evidence + all - worst.min(ACCEPT) + worst.clamp(WORN, ACCEPT) >= FOUND
+        };
+        let value = |l: &loops::Loop| l.evidence + costs(l).into_iter().map(|c| c.max(WORN)).sum::<f64>();
+        let believed = found.into_iter().filter(believed);
+        let mut keyed: Vec<(f64, loops::Loop)> = believed.map(|l| (value(&l), l)).collect();
         keyed.sort_by(|p, q| q.0.total_cmp(&p.0).then_with(|| p.1.edges.cmp(&q.1.edges)));
         for (_, l) in &keyed {
             for &k in &l.edges {
