@@ -199,7 +199,7 @@ impl Assembler<'_> {
     /// are off by more than others) are then taken apart and laid down piece by piece, if all find a place so.
     pub(super) fn fill(&mut self) {
         let mut fittings = Learnt::new();
-        self.fill_alone(&mut fittings);
+        self.fill_alone(&mut fittings, None);
         let most = self.state.largest() / STRAY_SHARE;
         let mut small: Vec<usize> =
             self.state.islands().filter(|k| (2..=most).contains(&self.state.size(*k))).collect();
@@ -213,7 +213,7 @@ impl Assembler<'_> {
             let saved = self.state.clone();
             let members: Vec<usize> = self.state.members(island).collect();
             self.detach(&members, &[]);
-            self.fill_alone(&mut fittings);
+            self.fill_alone(&mut fittings, Some(&members));
             if members.into_iter().any(|k| self.state.alone(k)) {
                 self.state = saved;
                 self.backtracks += 1;
@@ -221,18 +221,23 @@ impl Assembler<'_> {
         }
     }
 
-    /// Places single pieces, the best fitting first, as long as some fit like those that are placed. How these do is learnt
-    /// where it is not known yet.
-    fn fill_alone(&mut self, learnt: &mut Learnt) {
+    /// Places single pieces, the best fitting first, as long as some fit like those that are placed, and as long as one of
+    /// those `wanted` does. How these do is learnt where it is not known yet.
+    fn fill_alone(&mut self, learnt: &mut Learnt, wanted: Option<&[usize]>) {
         while !self.late() {
-            let trials = self.trials();
+            // The others, which are rivals, need not be looked at where none of the wanted fits.
+            if let Some(wanted) = wanted {
+                let trials = self.trials(|piece| wanted.contains(&piece));
+                self.learn_fitting(&trials, learnt);
+                if trials.iter().all(|t| self.evidence(learnt, t) < FOUND) {
+                    return;
+                }
+            }
+            let trials = self.trials(|_| true);
             if trials.is_empty() {
                 return;
             }
-            for t in &trials {
-                let of = self.fits_like(t.island);
-                learnt.entry(of).or_insert_with(|| self.fitting(of));
-            }
+            self.learn_fitting(&trials, learnt);
             let evidences: Vec<f64> = trials.iter().map(|t| self.evidence(learnt, t)).collect();
             let sure = |(t, evidence): (&Trial, &f64)| {
                 let others = trials.iter().zip(&evidences);
@@ -260,6 +265,14 @@ impl Assembler<'_> {
             if self.params.pose_graph {
                 islands.into_iter().for_each(|island| self.adjust(island, COARSE));
             }
+        }
+    }
+
+    /// Learns how pieces fit where some are tried, if it is not known.
+    fn learn_fitting(&self, trials: &[Trial], learnt: &mut Learnt) {
+        for t in trials {
+            let of = self.fits_like(t.island);
+            learnt.entry(of).or_insert_with(|| self.fitting(of));
         }
     }
 
@@ -291,11 +304,12 @@ impl Assembler<'_> {
         }
     }
 
-    /// Every piece left over in every free place that some candidate leads to; of one place the best pose.
-    fn trials(&self) -> Vec<Trial> {
+    /// Every wanted piece left over in every free place that some candidate leads to; of one place the best pose.
+    fn trials(&self, wanted: impl Fn(usize) -> bool) -> Vec<Trial> {
         let edges: Vec<(usize, usize)> = (0..self.edges.len())
-            .filter(|k| self.state.alone(self.edges[*k].a) != self.state.alone(self.edges[*k].b) && self.free(*k))
+            .filter(|k| self.state.alone(self.edges[*k].a) != self.state.alone(self.edges[*k].b))
             .map(|k| (k, if self.state.alone(self.edges[k].a) { self.edges[k].a } else { self.edges[k].b }))
+            .filter(|(k, piece)| wanted(*piece) && self.free(*k))
             .collect();
         let mut trials: Vec<Trial> = edges.par_iter().filter_map(|(k, piece)| self.trial(*k, *piece, None)).collect();
         trials.sort_by(|p, q| {

@@ -17,9 +17,10 @@ use std::collections::HashSet;
 
 /// Tabs tried for each mouth, in what the index keeps otherwise.
 const WIDER: usize = 8;
-/// Rough poses in all, about: some 30 ms of one core. Where so much is open that each mouth's share is no more than what
-/// the index keeps, a second look shows nothing new.
+/// Rough poses in all, about: some 30 ms of one core. Where so much is open that a mouth's share of them is less than this
+/// many times what the index keeps, too much is missing yet for a second look to be worth it.
 const TRIES: usize = 20_000;
+const LEAST: usize = 2;
 
 impl Assembler<'_> {
     /// Adds candidates between open isthmuses of different islands; tells whether there are any.
@@ -41,7 +42,7 @@ impl Assembler<'_> {
             mouths.extend(some.map(|mouth| (piece, mouth)));
         }
         let most = (TRIES / mouths.len().max(1)).min(WIDER * self.params.candidates);
-        if most <= self.params.candidates {
+        if most < LEAST * self.params.candidates {
             return false;
         }
         let index = Index::new(tabs);
