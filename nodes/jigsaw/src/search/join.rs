@@ -53,12 +53,12 @@ impl Assembler<'_> {
 
     /// Whether no other mating has taken either stretch of border, and its pieces don't wait.
     pub(super) fn free(&self, k: usize) -> bool {
-        !self.waits(k) && self.edges[k].slots.iter().all(|s| self.open(*s, k))
+        !self.waits(k) && self.edges[k].slots.iter().all(|s| self.open(*s, Some(k)))
     }
 
-    /// Whether no mating but `k` has taken an isthmus or one that claims the same stretch of border.
-    fn open(&self, slot: Slot, k: usize) -> bool {
-        let taken = |other: &Slot| self.state.mating_at(*other).is_some_and(|j| j != k);
+    /// Whether no mating (`but` one) has taken an isthmus or one that claims the same stretch of border.
+    pub(super) fn open(&self, slot: Slot, but: Option<usize>) -> bool {
+        let taken = |other: &Slot| self.state.mating_at(*other).is_some_and(|j| Some(j) != but);
         !self.slots.rivals(slot).iter().any(taken)
     }
 

@@ -61,6 +61,7 @@ pub(super) const FOUND: f64 = 4.5;
 pub(super) const IMPLAUSIBLE: f64 = -6.0;
 /// Most that one candidate counts against the pose that it shares with others.
 pub(super) const WORN: f64 = -3.0;
+
 impl Assembler<'_> {
     /// Finds loops among the best candidates to calibrate closure, clearance and residual, then, with what was learnt,
     /// among more. The best come first; what is more likely chance is left out.

@@ -9,7 +9,7 @@ use super::{Assembler, Mated, Outcome, edge};
 use crate::Policy;
 use crate::placement::{self, Joint};
 use crate::slots::Slot;
-use std::collections::HashMap;
+use std::collections::{BTreeMap, HashMap};
 
 /// An island of at most so many pieces is stray if the largest is this many times as large: pieces that lie face down
 /// or twice may well mate with one another, but where they belong is taken. Halves of mixed puzzles are larger.
@@ -158,9 +158,11 @@ impl Assembler<'_> {
         };
         let own: Vec<(f64, f64)> = joints.iter().map(own).collect();
         let mut clearances = vec![0.0; own.len()];
-        for island in self.state.islands() {
-            let here: Vec<usize> =
-                (0..own.len()).filter(|i| self.state.island(self.edges[joints[*i]].a) == island).collect();
+        let mut islands: BTreeMap<usize, Vec<usize>> = BTreeMap::new();
+        for (i, k) in joints.iter().enumerate() {
+            islands.entry(self.state.island(self.edges[*k].a)).or_default().push(i);
+        }
+        for here in islands.into_values() {
             let n = here.len() as f64;
             let mean = here.iter().map(|i| own[*i].0).sum::<f64>() / n;
             let noise = here.iter().map(|i| own[*i].1).sum::<f64>() / n;

@@ -25,7 +25,6 @@ const LEAST: usize = 2;
 impl Assembler<'_> {
     /// Adds candidates between open isthmuses of different islands; tells whether there are any.
     pub(super) fn widen(&mut self) -> bool {
-        let open = |s: &Slot| self.slots.rivals(*s).iter().all(|rival| self.state.mating_at(*rival).is_none());
         let waiting = (0..self.outlines.len()).filter(|k| !self.aside[*k]);
         let (mut tabs, mut mouths) = (Vec::new(), Vec::new());
         for piece in waiting {
@@ -35,10 +34,10 @@ impl Assembler<'_> {
                     .tabs
                     .iter()
                     .enumerate()
-                    .filter(|(k, _)| open(&self.slots.tab(piece, *k)))
+                    .filter(|(k, _)| self.open(self.slots.tab(piece, *k), None))
                     .map(|(tab, segment)| Entry { piece: piece as u32, tab: tab as u32, rank: piece as u32, segment }),
             );
-            let some = (0..outline.mouths.len()).filter(|k| open(&self.slots.mouth(piece, *k)));
+            let some = (0..outline.mouths.len()).filter(|k| self.open(self.slots.mouth(piece, *k), None));
             mouths.extend(some.map(|mouth| (piece, mouth)));
         }
         let most = (TRIES / mouths.len().max(1)).min(WIDER * self.params.candidates);
