@@ -4,12 +4,12 @@ with truth.
 Nothing here sleeps: a test waits for an event, and a time limit turns a missing event into a failure.
 """
 
+import contextlib
 import json
 import math
 import os
 import random
 import shutil
-import signal
 import socket
 import subprocess
 import sys
@@ -78,7 +78,10 @@ def transcode(binaries):
     transcode = Transcode()
     yield transcode
     transcode.process.stdin.close()
-    assert transcode.process.wait(EXIT_TIMEOUT) == 0
+    try:
+        assert transcode.process.wait(EXIT_TIMEOUT) == 0
+    finally:
+        transcode.process.kill()
 
 
 @pytest.fixture
@@ -95,6 +98,22 @@ def domain():
     pytest.fail("every DDS domain is in use")
 
 
+def end_all(children, patience):
+    """Ends processes as an operator would, and kills those that have not ended in time, or when waiting is cut short:
+    an rclpy node may miss the signal, or spin in its middleware's own end for ever. Gives their exit codes."""
+    due = time.monotonic() + patience
+    try:
+        for child in children:
+            child.terminate()
+        for child in children:
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                child.wait(max(0.0, due - time.monotonic()))
+    finally:
+        for child in children:
+            child.kill()
+    return [child.wait() for child in children]
+
+
 @dataclass
 class Process:
     """One of the binaries, running."""
@@ -107,15 +126,9 @@ class Process:
         return self.log.read_text(errors="replace")
 
     def stop(self):
-        """Ends it as an operator would; gives its exit code."""
-        if self.child.poll() is None:
-            self.child.send_signal(signal.SIGTERM)
-        try:
-            return self.child.wait(EXIT_TIMEOUT)
-        except subprocess.TimeoutExpired:
-            self.child.kill()
-            self.child.wait()
-            pytest.fail(f"{self.name} did not end within {EXIT_TIMEOUT} s of SIGTERM\n{self.text()}")
+        """Ends it as an operator would; gives its exit code, that of a kill if it did not end in time."""
+        (code,) = end_all([self.child], EXIT_TIMEOUT)
+        return code
 
     def wait(self, timeout=EVENT_TIMEOUT):
         """Waits for it to end by itself; gives its exit code."""
@@ -149,8 +162,9 @@ class Launcher:
     def run(self, name, *arguments, timeout=60):
         """Runs a binary to its end; gives its exit code and what it printed."""
         process = self.start(name, *arguments)
+        code = process.wait(timeout)
         self.processes.remove(process)
-        return process.wait(timeout), process.text()
+        return code, process.text()
 
     def cell(self, *ros_arguments):
         """The three nodes, a process each."""
@@ -158,18 +172,19 @@ class Launcher:
         return [self.start(name, *arguments) for name in ("capture_node", "feature_node", "solver_node")]
 
     def stop_all(self):
-        codes = {process.name: process.stop() for process in self.processes}
-        return codes
+        """Ends all that were started; gives names and exit codes of those that did not end cleanly."""
+        codes = end_all([process.child for process in self.processes], EXIT_TIMEOUT)
+        return [(process.name, code) for process, code in zip(self.processes, codes, strict=True) if code]
 
 
 @pytest.fixture
 def launcher(binaries, domain, tmp_path, request):
     launcher = Launcher(binaries, domain, tmp_path)
     yield launcher
-    codes = launcher.stop_all()
+    unclean = launcher.stop_all()
     for process in launcher.processes:  # shown by pytest where the test failed
         print(f"--- {process.name} ---\n{process.text()}")
-    assert not any(codes.values()), f"a node did not end cleanly: {codes}"
+    assert not unclean, f"nodes did not end cleanly: {unclean}"
 
 
 class Harness:

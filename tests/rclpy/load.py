@@ -15,6 +15,7 @@ import argparse
 import contextlib
 import json
 import os
+import signal
 import subprocess
 import sys
 import tempfile
@@ -33,12 +34,14 @@ from std_srvs.srv import Trigger
 
 import conftest  # noqa: F401  (sets the middleware's environment before rclpy is imported)
 from bench import BEST_EFFORT, LATCHED_PIECES, image_message
-from conftest import LATCHED, ROOT
+from conftest import LATCHED, ROOT, end_all
 
 NODES = ("capture_node", "feature_node", "solver_node")
 RATE = 30.0  # frames a second, where they do not come as fast as possible
 UNDER_WAY = 4  # frames that may be without features, as fast as possible: one a stage, and one on the way
 PATIENCE = 30.0  # seconds until something awaited counts as lost
+END_PATIENCE = 5.0  # seconds until a process that was told to end is killed
+LAST_WORDS = 10  # lines of a node's log that are shown where the run fails
 RELAY = "relayed"
 
 
@@ -151,6 +154,8 @@ def resident_mb(process):
 
 
 def row(name, seconds):
+    if not seconds:
+        return
     milliseconds = numpy.array(seconds) * 1e3
     p50, p99 = numpy.percentile(milliseconds, [50, 99])
     print(f"| {name} | {len(milliseconds)} | {p50:.1f} | {p99:.1f} | {milliseconds.max():.1f} |", flush=True)
@@ -169,27 +174,30 @@ def show_all(camera, frames, pace):
 def latency(camera, sets, rounds):
     for name, pace in (("30 Hz", RATE), ("as fast as possible", None)):
         features, assembled, complete, relayed, rates = [], [], [], [], []
-        # The first round warms everything up and is not counted.
-        for round_number in range(rounds + 1):
-            for frames in sets:
-                camera.reset()
-                show_all(camera, frames, pace)
-                camera.until(camera.is_complete(len(frames)), "complete assembly")
-                camera.until(camera.has_all_features, "features of every frame")
-                if round_number == 0:
-                    continue
-                with camera.changed:
-                    features += [camera.features[s] - t for s, t in camera.sent.items()]
-                    assembled += [camera.assembled[s] - t for s, t in camera.sent.items()]
-                    relayed += [camera.relayed[s] - t for s, t in camera.sent.items() if s in camera.relayed]
-                    complete.append(camera.complete[0] - max(camera.sent.values()))
-                    rates.append(len(frames) / (max(camera.sent.values()) - min(camera.sent.values())))
-        print(f"\n{name} ({numpy.median(rates):.0f} frames/s), {len(sets[0])} pieces a puzzle, {len(complete)} puzzles")
-        print("| from frame to | samples | p50 [ms] | p99 [ms] | max [ms] |\n| --- | --- | --- | --- | --- |")
-        row("the same frame through a plain rclpy relay", relayed)
-        row("features", features)
-        row("first assembly with the piece", assembled)
-        row("complete assembly (from the last frame)", complete)
+        try:
+            # The first round warms everything up and is not counted.
+            for round_number in range(rounds + 1):
+                for frames in sets:
+                    camera.reset()
+                    show_all(camera, frames, pace)
+                    camera.until(camera.is_complete(len(frames)), "complete assembly")
+                    camera.until(camera.has_all_features, "features of every frame")
+                    if round_number == 0:
+                        continue
+                    with camera.changed:
+                        features += [camera.features[s] - t for s, t in camera.sent.items()]
+                        assembled += [camera.assembled[s] - t for s, t in camera.sent.items()]
+                        relayed += [camera.relayed[s] - t for s, t in camera.sent.items() if s in camera.relayed]
+                        complete.append(camera.complete[0] - max(camera.sent.values()))
+                        rates.append(len(frames) / (max(camera.sent.values()) - min(camera.sent.values())))
+        finally:  # a run that is cut short tells what it has measured
+            rate = f"{numpy.median(rates):.0f} frames/s" if rates else "no figures"
+            print(f"\n{name} ({rate}), {len(sets[0])} pieces a puzzle, {len(complete)} puzzles")
+            print("| from frame to | samples | p50 [ms] | p99 [ms] | max [ms] |\n| --- | --- | --- | --- | --- |")
+            row("the same frame through a plain rclpy relay", relayed)
+            row("features", features)
+            row("first assembly with the piece", assembled)
+            row("complete assembly (from the last frame)", complete)
 
 
 def soak(camera, frames, total, pace, processes):
@@ -215,7 +223,7 @@ def soak(camera, frames, total, pace, processes):
             print(f"| {shown} | " + " | ".join(f"{m:.1f}" for m in memory) + f" | {rate:.0f} |", flush=True)
     camera.until(camera.is_complete(len(frames)), "complete assembly")
     half = len(sizes) // 2
-    growth = [numpy.array(sizes[k + 1 :]).max(axis=0) / numpy.array(sizes[k]) for k in (0, half)]
+    growth = [numpy.array(sizes[k:]).max(axis=0) / numpy.array(sizes[k]) for k in (0, half)]
     grown = [", ".join(f"{name} {100 * (g - 1):+.1f} %" for name, g in zip(NODES, gs, strict=True)) for gs in growth]
     times = ", ".join(map(str, sorted(set(counts.values()))))
     print(f"\n{shown} frames of {len(frames)} pieces, {shown // len(frames)} times each; features came {times} times.")
@@ -234,40 +242,48 @@ def main():
     arguments = parser.parse_args()
     if arguments.what == "relay":
         return relay(arguments.domain)
+    # Whoever ends this ends what it has started, too.
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit("load: ended by a signal"))
     environment = os.environ | {"ROS_DOMAIN_ID": str(arguments.domain), "ROS_LOCALHOST_ONLY": "1"}
     size = {"latency": (4, 6, 5), "soak": (8, 12, 1)}[arguments.what]
     expected = ["--ros-args", "-p", f"solver_node:expected_pieces:={size[0] * size[1]}"]
-    running = {}
+    commands = {name: [arguments.binaries / name, *expected] for name in NODES}
+    if arguments.what == "latency":
+        commands["relay"] = [sys.executable, __file__, "relay", "--domain", str(arguments.domain)]
+    with tempfile.TemporaryDirectory() as folder, running(commands, environment, Path(folder)) as processes:
+        sets = list(puzzles(arguments.binaries, Path(folder), *size, seed=500))
+        camera = Camera(arguments.domain)
+        warm_up(camera, sets[0][0], "relay" in processes)
+        if arguments.what == "latency":
+            latency(camera, sets, arguments.rounds)
+        else:
+            soak(camera, sets[0], arguments.frames, arguments.rate, processes)
+
+
+@contextlib.contextmanager
+def running(commands, environment, folder):
+    """The processes of these commands by their names; none of them is left in the end, whatever happens."""
+    processes = {}
     try:
-        with tempfile.TemporaryDirectory() as folder:
-            for name in NODES:
-                log = open(Path(folder) / f"{name}.log", "wb")
-                running[name] = subprocess.Popen([arguments.binaries / name, *expected], env=environment, stderr=log)
-            if arguments.what == "latency":
-                command = [sys.executable, __file__, "relay", "--domain", str(arguments.domain)]
-                running["relay"] = subprocess.Popen(command)
-            sets = list(puzzles(arguments.binaries, Path(folder), *size, seed=500))
-            camera = Camera(arguments.domain)
-            camera.until(lambda: camera.publisher.get_subscription_count() >= len(running) - 2, "subscriptions")
-            # Until the nodes have met one another as well.
-            warm_up(camera, sets[0][0])
-            if arguments.what == "latency":
-                latency(camera, sets, arguments.rounds)
-            else:
-                soak(camera, sets[0], arguments.frames, arguments.rate, running)
+        for name, command in commands.items():
+            with open(folder / f"{name}.log", "wb") as log:
+                processes[name] = subprocess.Popen(command, env=environment, stderr=log)
+        yield processes
+    except BaseException:
+        for name in processes:
+            lines = (folder / f"{name}.log").read_text(errors="replace").splitlines()[-LAST_WORDS:]
+            print(f"--- {name} ---", *lines, sep="\n", file=sys.stderr)
+        raise
     finally:
-        for process in running.values():
-            process.terminate()
-        for process in running.values():
-            process.wait(10)
+        end_all(processes.values(), END_PATIENCE)
 
 
-def warm_up(camera, frame):
-    """Shows a frame until an assembly tells of it."""
+def warm_up(camera, frame, relayed):
+    """Shows a frame until all have met all: an assembly tells of it, and the relay, if there is one, has it."""
     for _ in range(100):
         camera.show(frame)
         with camera.changed:
-            if camera.changed.wait_for(lambda: camera.assembled, 0.5):
+            if camera.changed.wait_for(lambda: camera.assembled and (camera.relayed or not relayed), 0.5):
                 return
     raise SystemExit("load: the nodes do not answer")
 

@@ -64,7 +64,7 @@ def test_a_node_that_has_ended_is_forgotten_at_once(launcher, ros):
     node = ros.node("looker")
     solver = launcher.start("solver_node")
     ros.until(lambda: not missing(node, "solver_node"), "solver node")
-    solver.stop()
+    assert solver.stop() == 0, solver.text()
     ros.until(lambda: not node.get_publishers_info_by_topic("/assembly"), "end of the publisher", LEASE / 2)
     assert "solver_node" not in node.get_node_names()
 
