@@ -1,8 +1,8 @@
 //! The composed cell: the three nodes in one process, joined by channels instead of DDS.
 //!
-//! Camera topics, services, parameters and results are on DDS as ever; `pieces/image`, `pieces/features` and `pieces/reset` are not.
-//! The nodes keep their names, so that `-p solver_node:policy:=paper` or a parameter file addresses one of them. A
-//! parameter without a node goes to every node that has it.
+//! Camera topics, services, parameters and results are on DDS as ever; what goes between the nodes (`pieces/image`,
+//! `pieces/features`, `pieces/reset`) is not. The nodes keep their names, so that `-p solver_node:policy:=paper` or a
+//! parameter file addresses one of them. A parameter without a node goes to every node that has it.
 
 use std::path::PathBuf;
 use std::process::ExitCode;

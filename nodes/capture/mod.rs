@@ -40,7 +40,7 @@ pub const PROGRAM: Program = Program {
     about: "Cuts camera frames into jigsaw pieces.\n\n\
             Topics in:  image (sensor_msgs/Image), image/compressed (sensor_msgs/CompressedImage),\n            \
             pieces/reset (std_msgs/Empty)\n\
-            Topic out:  pieces/image (jigsaw_msgs/PieceImage)\n\
+            Topics out: pieces/image (jigsaw_msgs/PieceImage), pieces/forgotten (jigsaw_msgs/PiecesForgotten)\n\
             Service:    capture (std_srvs/Trigger): take the pieces in view, or the folder, again",
     parameters: params::PARAMETERS,
 };
@@ -83,8 +83,8 @@ impl Heard {
 /// # Errors
 /// As for [`open`].
 pub fn open_with_topics(mut session: Session) -> Result<Work, ProcessError> {
-    let (pieces, _) = session.publish(&topics::PIECE_IMAGE)?;
-    let resets = session.subscribe(&topics::PIECES_RESET)?;
+    let (pieces, _, forgetting) = session.publish_kept(&topics::PIECE_IMAGE)?;
+    let resets = session.subscribe(&topics::PIECES_RESET)?.inspect(move |_| forgetting.forget());
     open(session, resets, pieces)
 }
 

@@ -23,8 +23,9 @@ use convert::PieceImageError;
 pub const PROGRAM: Program = Program {
     name: "feature_node",
     about: "Finds border, Euclidean skeleton and isthmuses of jigsaw pieces.\n\n\
-            Topic in:   pieces/image (jigsaw_msgs/PieceImage)\n\
-            Topics out: pieces/features (jigsaw_msgs/PieceFeatures),\n            \
+            Topics in:  pieces/image (jigsaw_msgs/PieceImage), pieces/reset (std_msgs/Empty),\n            \
+            pieces/forgotten (jigsaw_msgs/PiecesForgotten)\n\
+            Topics out: pieces/features (jigsaw_msgs/PieceFeatures), pieces/forgotten,\n            \
             pieces/overlay (sensor_msgs/Image, while someone listens)",
     parameters: params::PARAMETERS,
 };
@@ -51,15 +52,16 @@ impl Overlays {
 /// # Errors
 /// As for [`open`].
 pub fn open_with_topics(mut session: Session) -> Result<Work, ProcessError> {
-    let pieces = session.subscribe(&topics::PIECE_IMAGE)?;
-    let (features, audience) = session.publish(&topics::PIECE_FEATURES)?;
+    let pieces = session.subscribe_kept(&topics::PIECE_IMAGE)?.map(|(piece, _)| piece);
+    let (features, audience, forgetting) = session.publish_kept(&topics::PIECE_FEATURES)?;
+    let resets = session.subscribe(&topics::PIECES_RESET)?.inspect(move |_| forgetting.forget());
     if !session.parameters.bool(&params::SHARE) {
+        session.spawn(resets.for_each(|_| std::future::ready(())));
         return open(session, pieces, features);
     }
-    let heard = session.subscribe_with_writer(&topics::PIECE_FEATURES)?;
+    let heard = session.subscribe_kept(&topics::PIECE_FEATURES)?;
     let others = session.writers_of(&topics::PIECE_FEATURES)?;
     let (work, mine) = mpsc::channel(CHANNEL_DEPTH);
-    let resets = session.subscribe(&topics::PIECES_RESET)?;
     let streams = share::Streams { pieces, heard, resets, work, results: features.clone() };
     session.spawn(share::run(share::Share::new(audience.writer()), streams, others));
     open(session, mine, features)

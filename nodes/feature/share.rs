@@ -14,7 +14,7 @@ use std::hash::{DefaultHasher, Hash, Hasher};
 use std::time::{Duration, Instant};
 
 use futures::channel::mpsc;
-use futures::{SinkExt, StreamExt};
+use futures::{SinkExt, Stream, StreamExt};
 use jigsaw_msgs::msg::{PieceFeatures, PieceImage};
 use jigsaw_msgs::std_msgs::msg::Empty;
 use rustdds::GUID;
@@ -135,13 +135,13 @@ impl Share {
 }
 
 /// What goes in and out of [`run`].
-pub struct Streams {
+pub struct Streams<P, R> {
     /// All pieces.
-    pub pieces: mpsc::Receiver<PieceImage>,
+    pub pieces: P,
     /// All results, and from whom.
     pub heard: mpsc::Receiver<(PieceFeatures, GUID)>,
     /// The solver has forgotten all pieces.
-    pub resets: mpsc::Receiver<Empty>,
+    pub resets: R,
     /// The pieces that this node is to work on.
     pub work: mpsc::Sender<PieceImage>,
     /// Where results of nodes that have gone are published again.
@@ -149,8 +149,13 @@ pub struct Streams {
 }
 
 /// Takes from the pieces this node's share. Ends with the pieces.
-pub async fn run(mut share: Share, streams: Streams, others: impl Fn() -> Vec<GUID>) {
-    let Streams { mut pieces, mut heard, mut resets, mut work, mut results } = streams;
+pub async fn run(
+    mut share: Share,
+    streams: Streams<impl Stream<Item = PieceImage> + Unpin, impl Stream<Item = Empty> + Unpin>,
+    others: impl Fn() -> Vec<GUID>,
+) {
+    let Streams { pieces, mut heard, resets, mut work, mut results } = streams;
+    let (mut pieces, mut resets) = (pieces.fuse(), resets.fuse());
     let mut tick = StreamExt::fuse(smol::Timer::interval(LOOK_PERIOD));
     loop {
         let mut mine = Vec::new();

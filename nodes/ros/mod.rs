@@ -1,7 +1,7 @@
 //! Middleware glue: everything that knows DDS, and nothing that knows jigsaw puzzles beyond the names of the topics.
 //!
-//! Arrows point one way: [`process`] opens a [`session`]; what a session can do beyond topics ([`actions`], [`lifecycle`],
-//! [`raw`], `server`, [`services`]) stands beside it and is not known to it.
+//! Arrows point one way: [`process`] opens a [`session`]; what a session can do beyond topics ([`actions`], [`kept`],
+//! [`lifecycle`], [`raw`], `server`, [`services`]) stands beside it and is not known to it.
 //!
 //! | module | what stands there, and nowhere else |
 //! | --- | --- |
@@ -17,6 +17,7 @@
 //! | [`topics`] | every topic: message type, name, quality of service |
 //! | [`raw`] | topics whose type is known by name only |
 //! | [`session`] | one node: opens topics and services as streams and sinks |
+//! | [`kept`] | latched pieces, and which of them are forgotten |
 //! | [`peers`] | discovery without multicast |
 //! | `farewell` | says that a process leaves |
 //! | `turn` | the processes of a host open their endpoints one after the other |
@@ -30,6 +31,7 @@ pub mod activity;
 pub mod args;
 mod farewell;
 pub mod health;
+pub mod kept;
 pub mod lifecycle;
 pub mod logging;
 mod missed;

@@ -213,18 +213,11 @@ impl Session {
         self.subscribe_as(topic, |message, _| message)
     }
 
-    /// The messages of a topic, and which writer each is from.
+    /// The messages of a topic, made into something else together with what the middleware tells of each.
     ///
     /// # Errors
     /// As for [`Self::subscribe`].
-    pub fn subscribe_with_writer<M: Message>(
-        &mut self,
-        topic: &Topic<M>,
-    ) -> Result<mpsc::Receiver<(M, GUID)>, SessionError> {
-        self.subscribe_as(topic, |message, info| (message, GUID::from(info.publisher_gid())))
-    }
-
-    fn subscribe_as<M: Message, T: 'static>(
+    pub(super) fn subscribe_as<M: Message, T: 'static>(
         &mut self,
         topic: &Topic<M>,
         make: impl Fn(M, MessageInfo) -> T + 'static,
@@ -258,6 +251,15 @@ impl Session {
     /// # Errors
     /// As for [`Self::subscribe`].
     pub fn publish<M: Message>(&mut self, topic: &Topic<M>) -> Result<(mpsc::Sender<M>, Audience), SessionError> {
+        self.publish_counted(topic, || {})
+    }
+
+    /// As [`Self::publish`]; says of each message when it has been written.
+    pub(super) fn publish_counted<M: Message>(
+        &mut self,
+        topic: &Topic<M>,
+        written: impl Fn() + 'static,
+    ) -> Result<(mpsc::Sender<M>, Audience), SessionError> {
         let (name, dds_topic) = self.dds_topic(topic)?;
         let publisher = self
             .node
@@ -269,9 +271,10 @@ impl Session {
         let health = Arc::clone(&self.health);
         self.spawn(async move {
             while let Some(message) = receiver.next().await {
-                if publisher.async_publish(message).await.is_err() {
-                    health
-                        .warn("write", &format!("a message on {name} was not written: its readers are too far behind"));
+                match publisher.async_publish(message).await {
+                    Ok(()) => written(),
+                    Err(_) => health
+                        .warn("write", &format!("a message on {name} was not written: its readers are too far behind")),
                 }
             }
         });

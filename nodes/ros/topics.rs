@@ -5,7 +5,7 @@ use std::time::Duration;
 
 use jigsaw_msgs::diagnostic_msgs::msg::DiagnosticArray;
 use jigsaw_msgs::lifecycle_msgs::msg::TransitionEvent;
-use jigsaw_msgs::msg::{Assembly, PieceFeatures, PieceImage};
+use jigsaw_msgs::msg::{Assembly, PieceFeatures, PieceImage, PiecesForgotten};
 use jigsaw_msgs::rosgraph_msgs::msg::Clock;
 use jigsaw_msgs::sensor_msgs::msg::{CompressedImage, Image};
 use jigsaw_msgs::std_msgs::msg::Empty;
@@ -65,6 +65,9 @@ pub const PIECE_FEATURES: Topic<PieceFeatures> = Topic::new("pieces/features", L
 
 /// The solver has forgotten all pieces: those that are in view are new.
 pub const PIECES_RESET: Topic<Empty> = Topic::new("pieces/reset", RELIABLE.history(History::KeepLast { depth: 10 }));
+
+/// What of the latched pieces a node has forgotten.
+pub const PIECES_FORGOTTEN: Topic<PiecesForgotten> = Topic::new("pieces/forgotten", LATCHED);
 
 /// Pictures of the shape analysis.
 pub const OVERLAY: Topic<Image> = Topic::new("pieces/overlay", RELIABLE.history(History::KeepLast { depth: 10 }));

@@ -39,7 +39,7 @@ use journal::{Journal, JournalError};
 pub const PROGRAM: Program = Program {
     name: "solver_node",
     about: "Assembles jigsaw puzzles by shape.\n\n\
-            Topic in:   pieces/features (jigsaw_msgs/PieceFeatures)\n\
+            Topics in:  pieces/features (jigsaw_msgs/PieceFeatures), pieces/forgotten (jigsaw_msgs/PiecesForgotten)\n\
             Topics out: assembly (jigsaw_msgs/Assembly), /tf_static, assembly/image (sensor_msgs/Image),\n            \
             assembly/markers (visualization_msgs/MarkerArray), pieces/reset (std_msgs/Empty)\n\
             Services:   reset (std_srvs/Trigger): begin anew with the pieces in view; solve (std_srvs/Trigger): solve now\n\
@@ -105,7 +105,7 @@ pub async fn draw(
 /// # Errors
 /// As for [`open`].
 pub fn open_with_topics(mut session: Session) -> Result<Work, ProcessError> {
-    let features = session.subscribe(&topics::PIECE_FEATURES)?;
+    let features = session.subscribe_kept(&topics::PIECE_FEATURES)?.map(|(piece, _)| piece);
     let (resets, _) = session.publish(&topics::PIECES_RESET)?;
     open(session, features, resets)
 }

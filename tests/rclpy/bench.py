@@ -94,11 +94,11 @@ class Camera:
         period = math.inf if self.compressed else AGAIN
         return self.ros.until_repeated(lambda: self.publisher.publish(message), seen, f"sign of frame {second}", period)
 
-    def show_puzzle(self, puzzle, make=image_message, arm=None, **options):
+    def show_puzzle(self, puzzle, make=image_message, arm=None, first_second=1, **options):
         """Shows every frame; gives the truth of each piece by the id that the cell gave it. Where an arm is given, it
         has heard of each piece before the next one is shown."""
         truth = {}
-        for piece, grey, stamp in stamped_frames(puzzle):
+        for piece, grey, stamp in stamped_frames(puzzle, first_second):
             features = self.show(make(grey, stamp, **options))
             assert len(features) == 1, f"{piece['source']} holds one piece, the cell saw {len(features)}"
             assert features[0].header.frame_id == "camera"
@@ -119,9 +119,9 @@ class Camera:
         return truth
 
 
-def stamped_frames(puzzle):
+def stamped_frames(puzzle, first_second=1):
     """Every piece of a puzzle with its frame and a stamp of its own."""
-    for second, piece in enumerate(puzzle.truth["pieces"], start=1):
+    for second, piece in enumerate(puzzle.truth["pieces"], start=first_second):
         with Picture.open(puzzle.folder / piece["source"]) as picture:
             yield piece, numpy.asarray(picture.convert("L")), Time(sec=second, nanosec=500)
 

@@ -171,6 +171,13 @@ class Launcher:
         arguments = ["--ros-args", *ros_arguments] if ros_arguments else []
         return [self.start(name, *arguments) for name in ("capture_node", "feature_node", "solver_node")]
 
+    def kill_and_start_again(self, process):
+        """As a fault and a supervisor do; gives the process that stands in its place."""
+        process.child.kill()
+        process.wait()
+        self.processes.remove(process)
+        return self.start(process.name, *process.child.args[1:])
+
     def stop_all(self):
         """Ends all that were started; gives names and exit codes of those that did not end cleanly."""
         codes = end_all([process.child for process in self.processes], EXIT_TIMEOUT)

@@ -229,6 +229,36 @@ def test_reset_begins_anew_with_what_the_camera_sees(launcher, ros, generate, co
     assert not arm.complete(4).unplaced and not ids() & before
 
 
+def test_what_was_there_before_a_reset_does_not_come_back_with_a_node(launcher, ros, generate):
+    """Pieces are latched: a node that starts again hears those since the reset, and no others."""
+    _, feature, solver = launcher.cell(*SCALE)
+    camera, arm = Camera(ros), Arm(ros)
+    camera.show_puzzle(generate(2, 3, 5))
+    arm.complete(6)
+    assert ros.call(arm.node.create_client(Trigger, "reset"), Trigger.Request()).success
+    ros.until(lambda: not arm.assemblies[-1].pieces, "empty assembly")
+
+    def known_since():
+        return {name for a in arm.assemblies for name in [piece.id for piece in a.pieces] + list(a.unplaced)}
+
+    # Nothing has come since: the node begins with nothing.
+    arm.assemblies.clear()
+    solver = launcher.kill_and_start_again(solver)
+    truth = camera.show_puzzle(generate(2, 2, 7), first_second=101)
+    check_assembly(arm, truth, arm.complete(4))
+    assert known_since() == set(truth)
+
+    # It begins with what has come; so does one that hears it from a feature node that has begun anew as well.
+    for feature_too in (False, True):
+        arm.assemblies.clear()
+        arm.transforms.clear()
+        if feature_too:
+            launcher.kill_and_start_again(feature)
+        solver = launcher.kill_and_start_again(solver)
+        check_assembly(arm, truth, arm.complete(4))
+        assert known_since() == set(truth)
+
+
 def test_piece_twice_in_the_frame_order_or_not_gives_the_same(launcher, ros, generate):
     """A camera that runs on shows every piece again and again; each is counted once."""
     launcher.cell(*SCALE)

@@ -27,14 +27,14 @@ LIFECYCLE = {
 }
 EVERY_NODE = {"/diagnostics", "/parameter_events", "/rosout"}
 PUBLISHED = {
-    "capture_node": {"/pieces/image"},
-    "feature_node": {"/pieces/features", "/pieces/overlay"},
+    "capture_node": {"/pieces/forgotten", "/pieces/image"},
+    "feature_node": {"/pieces/features", "/pieces/forgotten", "/pieces/overlay"},
     "solver_node": {"/assembly", "/assembly/image", "/assembly/markers", "/tf_static"},
 }
 HEARD = {
-    "capture_node": {"/image", "/image/compressed"},
-    "feature_node": {"/pieces/image"},
-    "solver_node": {"/pieces/features"},
+    "capture_node": {"/image", "/image/compressed", "/pieces/reset"},
+    "feature_node": {"/pieces/forgotten", "/pieces/image", "/pieces/reset"},
+    "solver_node": {"/pieces/features", "/pieces/forgotten"},
 }
 SERVED = {"capture_node": {"/capture"}, "feature_node": set(), "solver_node": {"/reset", "/solve"}}
 
