@@ -2,7 +2,7 @@
 //!
 //! # Method
 //! 1. *Ground*: the frame is averaged over small blocks; the class of blocks (N. Otsu, 1979) that prevails along the rim is
-//!    ground, and a quadratic surface through it follows uneven light. Shapes may be darker, brighter or of another colour. Where
+//!    ground, and a quadratic surface through it follows uneven light. Shapes may be darker, brighter or of another colour; the ground may be grained. Where
 //!    the rim does not tell (a tight crop round a shape), both classes are tried, and the one that gives
 //!    whole shapes is right.
 //! 2. *Blocks that stand out* from the ground by more than its scatter are joined to connected components. The threshold is
@@ -80,7 +80,7 @@ impl Segmenter {
         self.blocks.fill(frame);
         let mut best: Option<(usize, Segmentation)> = None;
         for candidate in ground::candidates(&self.blocks) {
-            let ground = ground::fit(frame, &self.blocks, candidate, std::mem::take(&mut self.residual));
+            let ground = ground::find(frame, &self.blocks, candidate, std::mem::take(&mut self.residual));
             let segmentation = self.shapes(frame, &ground, parameters);
             self.residual = ground.residual;
             let area = segmentation.cutouts.iter().map(|c| c.aoi.width as usize * c.aoi.height as usize).sum();

@@ -7,7 +7,8 @@ mod shapes;
 use isthmus::Extractor;
 use isthmus::contour::Border;
 use isthmus::mask::{Frame, Parameters, Reason, Segmentation, segment};
-use shapes::{Camera, Neck, Piece, pose};
+use rand::{SeedableRng, rngs::StdRng};
+use shapes::{Camera, Neck, Piece, blur, normal, pose};
 
 /// Side of the frames, in pixels.
 const SIDE: usize = 900;
@@ -114,6 +115,55 @@ fn a_ground_of_another_colour() {
         let frame = Frame::rgb(SIDE as u32, SIDE as u32, &pixels).unwrap();
         check(&segment(&frame, &Parameters::default()), &necks, &format!("{shape:?} on {ground:?}"));
     }
+}
+
+/// The scene's pieces by a part of each pixel, from 0 to 1.
+fn coverage() -> (Vec<f64>, Vec<Neck>) {
+    let (levels, necks) = scene(Camera { shape_level: 255.0, ground_level: 0.0, noise: 0.0, ..Camera::default() });
+    (levels.into_iter().map(|c| f64::from(c) / 255.0).collect(), necks)
+}
+
+/// The grain is as strong as the difference in brightness between pieces and ground.
+#[test]
+fn a_table_of_wood() {
+    const WOOD: [f64; 3] = [150.0, 105.0, 65.0];
+    let (coverage, necks) = coverage();
+    for piece in [[170.0, 165.0, 155.0], [90.0, 110.0, 150.0]] {
+        let mut rng = StdRng::seed_from_u64(7);
+        // Grain runs from top to bottom: lines of all widths.
+        let mut grain = vec![0.0; SIDE];
+        for width in [3.0, 12.0, 50.0] {
+            let mut lines: Vec<f64> = (0..SIDE).map(|_| normal(&mut rng)).collect();
+            blur(&mut lines, SIDE, 1, width);
+            let power = (lines.iter().map(|l| l * l).sum::<f64>() / SIDE as f64).sqrt();
+            grain.iter_mut().zip(&lines).for_each(|(grain, line)| *grain += 0.08 * line / power);
+        }
+        let mut pixels = Vec::with_capacity(3 * coverage.len());
+        for (k, c) in coverage.iter().enumerate() {
+            let light = 1.0 + grain[k % SIDE];
+            for (wood, piece) in WOOD.into_iter().zip(piece) {
+                let level = wood * light * (1.0 - c) + piece * c + 4.0 * normal(&mut rng);
+                pixels.push(level.round().clamp(0.0, 255.0) as u8);
+            }
+        }
+        let frame = Frame::rgb(SIDE as u32, SIDE as u32, &pixels).unwrap();
+        check(&segment(&frame, &Parameters::default()), &necks, &format!("{piece:?} on wood"));
+    }
+}
+
+/// Light that falls off to the left and to all corners: the brightest ground has five times the level of the darkest, pieces three
+/// quarters of that of the ground round them. No level tells the two apart.
+#[test]
+fn light_from_one_side() {
+    let (coverage, necks) = coverage();
+    let mut rng = StdRng::seed_from_u64(8);
+    let level = |(k, c): (usize, &f64)| {
+        let (x, y) = ((k % SIDE) as f64 / SIDE as f64, (k / SIDE) as f64 / SIDE as f64);
+        let light = 200.0 * (0.3 + 0.9 * x + 0.5 * y) * (1.0 - 1.2 * ((x - 0.5).powi(2) + (y - 0.5).powi(2)));
+        (light * (1.0 - 0.25 * c) + 3.0 * normal(&mut rng)).round().clamp(0.0, 255.0) as u8
+    };
+    let pixels: Vec<u8> = coverage.iter().enumerate().map(level).collect();
+    check(&grey(&pixels), &necks, "light from one side");
 }
 
 #[test]

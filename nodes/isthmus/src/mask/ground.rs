@@ -2,11 +2,14 @@
 //!
 //! The frame is averaged over small blocks. Otsu's threshold on the channel that separates best, and the classes' share of
 //! the frame's outer rows and columns, tell the ground from the shapes. A quadratic surface through the ground's
-//! blocks follows uneven light; what differs from it by more than its scatter is shape.
+//! blocks follows uneven light; what differs from it by more than its scatter is shape. Of a colour frame differences are taken
+//! in the metric of the ground's own scatter (P. C. Mahalanobis, 1936): grain of wood and folds of cloth differ in
+//! brightness, hardly in hue. Where the light varies by more than shapes and ground differ, no threshold tells the two apart; then the ground is
+//! sought along the frame's rim.
 
 use super::clipping::Clipping;
 use super::frame::Frame;
-use nalgebra::{Matrix6, Vector6};
+use nalgebra::{Matrix3, Matrix6, Vector3, Vector6};
 
 /// Means over square blocks of pixels.
 #[derive(Debug, Clone, Default)]
@@ -224,6 +227,10 @@ pub(super) struct Ground {
     pub(super) threshold: f32,
     /// Standard deviation of the ground's blocks.
     pub(super) scatter: f32,
+    /// How much blocks that stand out do so on the mean, in such deviations.
+    pub(super) clarity: f32,
+    /// The metric of differences in colour; none where the ground scatters alike in all directions.
+    pub(super) metric: Option<Metric>,
     /// What noise beyond black and white does to the means of blocks; the surfaces are free of it, the residuals are not.
     clipping: Option<Clipping>,
 }
@@ -233,12 +240,59 @@ impl Ground {
     pub(super) fn contrast(&self, blocks: &Blocks, column: usize, row: usize) -> f32 {
         let block = row * blocks.columns + column;
         let Some(clipping) = &self.clipping else { return self.residual[block] };
-        let channels = blocks.planes.iter().zip(&self.surfaces);
-        let differences = channels
-            .map(|(plane, surface)| (clipping.level(plane[block]) - surface.at(column as f64, row as f64)).abs());
-        differences.fold(0.0, f32::max)
+        self.difference([column as f64, row as f64], |c| clipping.level(blocks.planes[c][block]))
+    }
+
+    /// By how much the levels of a block differ from the ground: in the metric, by the largest of the channels.
+    fn difference(&self, [column, row]: [f64; 2], level: impl Fn(usize) -> f32) -> f32 {
+        let differences = self.surfaces.iter().enumerate().map(|(c, surface)| level(c) - surface.at(column, row));
+        match &self.metric {
+            None => differences.fold(0.0, |most, d| most.max(d.abs())),
+            Some(metric) => {
+                let mut colour = [0.0; 3];
+                colour.iter_mut().zip(differences).for_each(|(colour, d)| *colour = d);
+                metric.length(colour)
+            }
+        }
     }
 }
+
+/// Differences in colour, shortened where the ground itself scatters.
+#[derive(Debug, Clone)]
+pub(super) struct Metric([[f32; 3]; 3]);
+
+impl Metric {
+    /// Metric of the ground's differences from its surface; none for scatter that is little or the same in all directions.
+    fn of(differences: &[Vector3<f32>]) -> Option<Self> {
+        let mut sums = Matrix3::zeros();
+        for d in differences {
+            sums += d * d.transpose();
+        }
+        let eigen = sums.cast::<f64>().symmetric_eigen();
+        let axes = eigen.eigenvectors.cast::<f32>();
+        // What is no ground makes far outliers: medians rather than the sums themselves.
+        let along = |axis: usize| median(differences.iter().map(|d| axes.column(axis).dot(d).abs()).collect());
+        let scatter = [0, 1, 2].map(|axis| (along(axis) / NORMAL_MAD).max(MIN_SCATTER));
+        let [least, most] = [f32::min, f32::max].map(|pick| scatter.into_iter().reduce(pick).unwrap_or(MIN_SCATTER));
+        if most.is_nan() || most <= EVEN_SCATTER * least {
+            return None;
+        }
+        let weights = Matrix3::from_diagonal(&Vector3::from(scatter.map(|s| least / s)));
+        let metric = axes * weights * axes.transpose();
+        Some(Self([0, 1, 2].map(|row| [0, 1, 2].map(|column| metric[(row, column)]))))
+    }
+
+    /// Length of a difference: the largest of the channels, as everywhere.
+    pub(super) fn length(&self, [r, g, b]: [f32; 3]) -> f32 {
+        let channel = |w: &[f32; 3]| (w[0] * r + w[1] * g + w[2] * b).abs();
+        self.0.iter().map(channel).fold(0.0, |most, d| if d > most { d } else { most })
+    }
+}
+
+/// Least scatter of the ground's blocks along an axis of colour, in grey levels: less is not told from rounding and compression.
+const MIN_SCATTER: f32 = 2.0;
+/// Scatter that differs by less than this factor between directions is taken for even: its measure is that of medians.
+const EVEN_SCATTER: f32 = 1.5;
 
 /// A block that differs from the ground by more than this many standard deviations of the ground's blocks is shape.
 const OUTLIER: f32 = 6.0;
@@ -247,6 +301,11 @@ const MIN_RESIDUAL: f32 = 6.0;
 /// Least difference from the ground as a part of what shapes have on the middle: shadows and glare round them have less,
 /// dark print on black more.
 const MIN_RELATIVE_RESIDUAL: f32 = 0.12;
+/// Shapes that stand out by at least so many deviations of the ground are a class of their own, told from it half-way; of what follows
+/// from noise alone the upper class stands out by two.
+const CLASS_CLARITY: f32 = 4.0;
+/// Shapes that stand out by fewer deviations may do so from a wrong ground, one side of uneven light taken for shape.
+const CLEAR: f32 = 2.0 * CLASS_CLARITY;
 /// Blocks that are looked at to find the ground: a shape of a thousandth of the frame still has several among them.
 const SAMPLES: usize = 5_000;
 /// Blocks used for the fit: more do not make a quadratic any better.
@@ -255,6 +314,8 @@ const FIT_SAMPLES: usize = 800;
 const SCATTER_STEP: usize = 4;
 /// Median absolute deviation of a normal distribution of standard deviation 1.
 const NORMAL_MAD: f32 = 0.674_5;
+/// Median of the largest of three such deviations: of those in three channels.
+const LARGEST_OF_THREE: f32 = 1.260_8;
 /// Rounds of fitting the ground and asking again what belongs to it.
 const ROUNDS: usize = 3;
 /// Depths in the frame, as parts of its smaller side, at which rows and columns vote for the ground: beyond scanner edges, and
@@ -347,27 +408,47 @@ fn rim_blocks(blocks: &Blocks) -> impl Iterator<Item = usize> {
     })
 }
 
+/// Finds the ground that a class of blocks belongs to, or, where nothing stands out from that clearly, the rim; `residual` is memory to be
+/// used again.
+pub(super) fn find(frame: &Frame<'_>, blocks: &Blocks, candidate: Candidate, residual: Vec<f32>) -> Ground {
+    let ground = fit(frame, blocks, candidate, residual);
+    if ground.clarity >= CLEAR {
+        return ground;
+    }
+    let rim = fit(frame, blocks, along_rim(blocks), Vec::new());
+    if rim.clarity > ground.clarity { rim } else { ground }
+}
+
+/// The rim taken for ground: a surface through it runs under all shapes, whatever the light.
+fn along_rim(blocks: &Blocks) -> Candidate {
+    let (columns, rows) = (blocks.columns, blocks.rows);
+    let depth = (RIM_DEPTHS[RIM_DEPTHS.len() - 1] * columns.min(rows) as f64) as usize;
+    let is_near = |at: u32, count: usize| at as usize <= depth || at as usize + depth + 1 >= count;
+    Candidate { is_ground: blocks.samples.iter().map(|s| is_near(s.column, columns) || is_near(s.row, rows)).collect() }
+}
+
 /// Fits the ground to a class of blocks, and finds what stands out from it; `residual` is memory to be used again.
-pub(super) fn fit(frame: &Frame<'_>, blocks: &Blocks, candidate: Candidate, residual: Vec<f32>) -> Ground {
+fn fit(frame: &Frame<'_>, blocks: &Blocks, candidate: Candidate, residual: Vec<f32>) -> Ground {
     let Candidate { mut is_ground } = candidate;
     let mut ground = Ground::default();
     let mut residuals = Vec::with_capacity(is_ground.len());
     for _ in 0..ROUNDS {
         ground.surfaces = blocks.planes.iter().map(|plane| fit_surface(blocks, plane, &is_ground, None)).collect();
-        let residual_of = |s: &Sample| {
-            let channels = blocks.planes.iter().zip(&ground.surfaces);
-            let (column, row) = (f64::from(s.column), f64::from(s.row));
-            channels.map(|(plane, surface)| (plane[s.block] - surface.at(column, row)).abs()).fold(0.0, f32::max)
-        };
+        ground.metric = metric(blocks, &ground.surfaces, &is_ground);
+        let residual_of =
+            |s: &Sample| ground.difference([s.column, s.row].map(f64::from), |c| blocks.planes[c][s.block]);
         residuals.clear();
         residuals.extend(blocks.samples.iter().map(residual_of));
         let of_ground = residuals.iter().zip(&is_ground).filter(|(_, g)| **g);
         let scatter: Vec<f32> = of_ground.step_by(SCATTER_STEP).map(|(r, _)| *r).collect();
-        let sigma = median(scatter) / NORMAL_MAD;
+        let sigma = median(scatter) / if ground.surfaces.len() == 1 { NORMAL_MAD } else { LARGEST_OF_THREE };
         let split = otsu(&residuals);
         let standing_out = split.mean_above;
         ground.scatter = sigma;
-        ground.threshold = (OUTLIER * sigma).max(MIN_RESIDUAL).max(MIN_RELATIVE_RESIDUAL * standing_out);
+        ground.clarity = standing_out / sigma.max(f32::MIN_POSITIVE);
+        let outlier = OUTLIER * sigma;
+        let outlier = if ground.clarity >= CLASS_CLARITY { outlier.min(standing_out / 2.0) } else { outlier };
+        ground.threshold = outlier.max(MIN_RESIDUAL).max(MIN_RELATIVE_RESIDUAL * standing_out);
         let half = (standing_out / 2.0).max(ground.threshold);
         // Whatever is nearer to the ground than to the shapes may be ground, shadows included; the next fit is robust.
         let mut changed = false;
@@ -382,6 +463,39 @@ pub(super) fn fit(frame: &Frame<'_>, blocks: &Blocks, candidate: Candidate, resi
     }
     ground.residual = residual;
     ground.residual.resize(blocks.columns * blocks.rows, 0.0);
+    fill_residuals(blocks, &mut ground);
+    ground.clipping = clipping(frame, blocks, &is_ground);
+    if let Some(clipping) = &ground.clipping {
+        let fit = |plane: &Vec<f32>| fit_surface(blocks, plane, &is_ground, Some(clipping));
+        ground.surfaces = blocks.planes.iter().map(fit).collect();
+    }
+    ground
+}
+
+/// The metric of the ground's blocks; none for a grey frame.
+fn metric(blocks: &Blocks, surfaces: &[Surface], is_ground: &[bool]) -> Option<Metric> {
+    let ([r, g, b], [red, green, blue]) = (&blocks.planes[..], surfaces) else { return None };
+    let of_ground = blocks.samples.iter().zip(is_ground).filter(|(_, is_ground)| **is_ground);
+    let difference = |(s, _): (&Sample, &bool)| {
+        let (column, row) = (f64::from(s.column), f64::from(s.row));
+        let channels = [(r, red), (g, green), (b, blue)];
+        Vector3::from(channels.map(|(plane, surface)| plane[s.block] - surface.at(column, row)))
+    };
+    Metric::of(&of_ground.step_by(SCATTER_STEP).map(difference).collect::<Vec<_>>())
+}
+
+/// Finds by how much each block differs from the ground.
+fn fill_residuals(blocks: &Blocks, ground: &mut Ground) {
+    if let (Some(metric), [r, g, b], [red, green, blue]) = (&ground.metric, &blocks.planes[..], &ground.surfaces[..]) {
+        for (row, residuals) in ground.residual.chunks_exact_mut(blocks.columns).enumerate() {
+            let channels = [(r, red), (g, green), (b, blue)]
+                .map(|(plane, surface)| (&plane[row * blocks.columns..], surface.along(row as f64, 0.0, 1.0)));
+            for (column, residual) in residuals.iter_mut().enumerate() {
+                *residual = metric.length(channels.map(|(values, levels)| values[column] - levels.at(column)));
+            }
+        }
+        return;
+    }
     for (channel, (plane, surface)) in blocks.planes.iter().zip(&ground.surfaces).enumerate() {
         let rows = plane.chunks_exact(blocks.columns).zip(ground.residual.chunks_exact_mut(blocks.columns));
         for (row, (values, residuals)) in rows.enumerate() {
@@ -392,12 +506,6 @@ pub(super) fn fit(frame: &Frame<'_>, blocks: &Blocks, candidate: Candidate, resi
             }
         }
     }
-    ground.clipping = clipping(frame, blocks, &is_ground);
-    if let Some(clipping) = &ground.clipping {
-        let fit = |plane: &Vec<f32>| fit_surface(blocks, plane, &is_ground, Some(clipping));
-        ground.surfaces = blocks.planes.iter().map(fit).collect();
-    }
-    ground
 }
 
 /// What noise does to the levels of a frame, if it reaches beyond black or white anywhere.

@@ -377,7 +377,14 @@ impl Levels {
             line.clear();
             line.resize(out.len(), 0.0);
         }
-        for (c, ground) in rows.ground.surfaces.iter().enumerate() {
+        if let (Some(metric), [r, g, b]) = (&rows.ground.metric, &rows.ground.surfaces[..]) {
+            let ground = [r, g, b].map(|surface| surface.along(row, column, step));
+            for (i, (d, p)) in difference.iter_mut().zip(source.as_chunks::<3>().0).enumerate() {
+                *d = metric.length([0, 1, 2].map(|c| f32::from(p[c]) - ground[c].at(i)));
+            }
+        }
+        let channel_by_channel = if rows.ground.metric.is_some() { &[] } else { &rows.ground.surfaces[..] };
+        for (c, ground) in channel_by_channel.iter().enumerate() {
             let ground = ground.along(row, column, step);
             for (i, (d, p)) in difference.iter_mut().zip(source.iter().skip(c).step_by(channels)).enumerate() {
                 let signed = f32::from(*p) - ground.at(i);
