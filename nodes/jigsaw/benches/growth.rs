@@ -5,7 +5,8 @@
 //! Features are made from true outlines, so that only matching and assembly are timed. Each row gives the best of a few
 //! runs in milliseconds (matching, assembly), the processor time of both on all threads, the exponent with which it has
 //! grown since the row before (1 is linear), what one more piece costs when all others are solved already (median of a
-//! few; time and processor time), the greatest memory that the process has held so far, and how many pieces were placed.
+//! few; time and processor time), what each costs when all come one after another from all over the puzzle (mean and most,
+//! processor time; of puzzles of some hundred pieces at most), the greatest memory that the process has held so far, and how many pieces were placed.
 //! Processor time and memory are read from `/proc`, and are missing where there is none.
 
 use anyhow::Context;
@@ -57,8 +58,35 @@ struct Row {
     processor: f64,
     more: f64,
     more_processor: f64,
+    /// Mean and most, one after another.
+    each: [f64; 2],
     peak: f64,
     placed: usize,
+}
+
+/// Processor time of each solution when pieces come one after another from all over the puzzle, mean and most.
+fn one_by_one(pieces: &[Piece]) -> anyhow::Result<[f64; 2]> {
+    /// More take minutes.
+    const MOST: usize = 320;
+    /// Steps of the golden section visit all places evenly.
+    const GOLDEN: f64 = 0.618_033_988_749_895;
+    let n = pieces.len();
+    if n > MOST {
+        return Ok([f64::NAN; 2]);
+    }
+    let mut order: Vec<usize> = (0..n).collect();
+    order.sort_by(|p, q| (*p as f64 * GOLDEN).fract().total_cmp(&(*q as f64 * GOLDEN).fract()));
+    let mut solver = Solver::new(Params::default())?;
+    let (mut sum, mut most) = (0.0, 0.0f64);
+    for k in order {
+        solver.insert(pieces[k].clone())?;
+        let before = processor_time();
+        solver.solve();
+        let took = processor_time() - before;
+        sum += took;
+        most = most.max(took);
+    }
+    Ok([sum / n as f64, most])
 }
 
 fn measure(count: usize) -> anyhow::Result<Row> {
@@ -71,6 +99,7 @@ fn measure(count: usize) -> anyhow::Result<Row> {
         processor: f64::INFINITY,
         more: 0.0,
         more_processor: 0.0,
+        each: one_by_one(&pieces)?,
         peak: 0.0,
         placed: 0,
     };
@@ -178,8 +207,18 @@ fn main() -> anyhow::Result<()> {
         counts = vec![24, 300, 1000];
     }
     println!(
-        "{:>6} {:>9} {:>9} {:>9} {:>8} {:>8} {:>9} {:>9} {:>7}",
-        "pieces", "match ms", "asm ms", "cpu ms", "exponent", "+1 ms", "+1 cpu ms", "peak MiB", "placed"
+        "{:>6} {:>9} {:>9} {:>9} {:>8} {:>8} {:>9} {:>8} {:>8} {:>9} {:>7}",
+        "pieces",
+        "match ms",
+        "asm ms",
+        "cpu ms",
+        "exponent",
+        "+1 ms",
+        "+1 cpu ms",
+        "each ms",
+        "most ms",
+        "peak MiB",
+        "placed"
     );
     let mut rows: Vec<Row> = Vec::new();
     for count in counts {
@@ -188,13 +227,15 @@ fn main() -> anyhow::Result<()> {
             (row.processor / before.processor).ln() / (row.pieces as f64 / before.pieces as f64).ln()
         });
         println!(
-            "{:6} {:9.1} {:9.1} {:9.1} {exponent:8.2} {:8.1} {:9.1} {:9.0} {:7}",
+            "{:6} {:9.1} {:9.1} {:9.1} {exponent:8.2} {:8.1} {:9.1} {:8.1} {:8.1} {:9.0} {:7}",
             row.pieces,
             1e3 * row.matching,
             1e3 * row.assembly,
             1e3 * row.processor,
             1e3 * row.more,
             1e3 * row.more_processor,
+            1e3 * row.each[0],
+            1e3 * row.each[1],
             row.peak,
             row.placed
         );

@@ -13,6 +13,7 @@ mod frame;
 mod index;
 mod loops;
 mod matching;
+mod memory;
 mod outline;
 mod paper;
 pub mod params;

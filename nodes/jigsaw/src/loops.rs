@@ -78,10 +78,12 @@ struct Place {
     x: f64,
 }
 
-/// How far two poses of a piece are apart: of its centroid in piece scales, and in angle.
-pub(crate) fn difference(outline: &Outline, p: &Isometry2<f64>, q: &Isometry2<f64>) -> (f64, f64) {
-    let d: Vector2<f64> = p * outline.centroid - q * outline.centroid;
-    (d.norm() / outline.scale, p.rotation.angle_to(&q.rotation).abs())
+impl Tolerance {
+    /// Whether two poses of a piece differ by no more.
+    pub(crate) fn allows(&self, outline: &Outline, p: &Isometry2<f64>, q: &Isometry2<f64>) -> bool {
+        let d: Vector2<f64> = p * outline.centroid - q * outline.centroid;
+        d.norm() <= self.position * outline.scale && p.rotation.angle_to(&q.rotation).abs() <= self.angle
+    }
 }
 
 /// Pose of the piece `e.a` (or `e.b`) as seen from the other one, and what the candidate leaves open of it at
@@ -325,8 +327,7 @@ impl<'a> Ways<'a> {
             _ => return None,
         };
         let outline = self.outlines[p.to];
-        let (d, turn) = difference(outline, &p.pose, &q.pose);
-        if d > self.tolerance.position || turn > self.tolerance.angle {
+        if !self.tolerance.allows(outline, &p.pose, &q.pose) {
             return None;
         }
         if self.slots.conflict(self.leaves(a, p), self.leaves(a, q))

@@ -48,6 +48,11 @@ impl Match {
         let tab = &outlines[hit.piece as usize].tabs[hit.tab as usize];
         Self { hit, rough: placement::rough(tab, mouth, scale, free, feet), coarse: None, fine: None }
     }
+
+    /// The same tab, as the index finds it now.
+    pub(crate) fn again(self, hit: Hit) -> Self {
+        Self { hit, ..self }
+    }
 }
 
 /// Candidates of a mouth that are refined in any case.

@@ -28,9 +28,16 @@ pub(crate) fn turned(rotation: UnitComplex<f64>) -> Matrix3<f64> {
     rotation.to_rotation_matrix().to_homogeneous()
 }
 
-/// Motions (x, y, turn about the reference point) of all nodes that minimise the sum of the factors.
-pub(crate) fn minimise(references: &[Point2<f64>], factors: &[Factor]) -> Vec<Vector3<f64>> {
-    Plan::new(references, factors).minimise(references, factors)
+/// Motion (x, y, turn about the reference point) of one node, the `a` of all factors, that minimises their sum while all
+/// others are held; `None` if they leave it open.
+pub(crate) fn settle(reference: Point2<f64>, factors: &[Factor]) -> Option<Vector3<f64>> {
+    let (mut hessian, mut right) = (Matrix3::zeros(), Vector3::zeros());
+    for f in factors {
+        let j = lever(reference, f.centre);
+        hessian += j.transpose() * f.hessian * j;
+        right -= j.transpose() * f.gradient;
+    }
+    hessian.cholesky().map(|h| h.solve(&right))
 }
 
 /// In which order nodes are eliminated, and between which of them blocks then stand: a matter of which nodes factors
@@ -95,7 +102,7 @@ impl Plan {
         row.binary_search(&second).ok().map(|k| self.starts[first] + k)
     }
 
-    /// As [`minimise`], for factors that the plan suits.
+    /// Motions (x, y, turn about the reference points) of all nodes that minimise the sum of factors, which the plan suits.
     pub(crate) fn minimise(&self, references: &[Point2<f64>], factors: &[Factor]) -> Vec<Vector3<f64>> {
         let n = self.order.len();
         // From here on nodes go by their place in the order.
@@ -220,7 +227,7 @@ mod tests {
                 }
             })
             .collect();
-        let motion = minimise(&references, &factors);
+        let motion = Plan::new(&references, &factors).minimise(&references, &factors);
         let mut gradient = vec![Vector3::<f64>::zeros(); 6];
         for f in &factors {
             let (ja, jb) = (lever(references[f.a], f.centre), lever(references[f.b], f.centre));

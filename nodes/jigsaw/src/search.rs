@@ -7,7 +7,7 @@
 //!    ([`crate::posegraph`]).
 //! 3. [`grow`]: islands and single pieces joined by the candidates that agree on a pose.
 //! 4. [`verify`]: pieces that overlap or contradict their neighbours are taken out, and others tried in their place.
-//! 5. [`widen`], [`fill`]: what is left over, by a second look at what is open, and by whole borders.
+//! 5. [`widen`], [`fill`]: what is left over, by a second look at what is open, and by how whole borders [`fit`].
 //! 6. [`outcome`]: which contacts are matings, and how sure all that is.
 //!
 //! What the steps change and take back is [`state`].
@@ -15,6 +15,7 @@
 mod adjust;
 mod descent;
 mod fill;
+mod fit;
 mod grow;
 mod join;
 mod learn;
@@ -23,9 +24,10 @@ mod state;
 mod verify;
 mod widen;
 
-use crate::contact::{ClearancePrior, Memory};
+use crate::contact::ClearancePrior;
 use crate::copies::copies;
 use crate::loops::{Closure, Edge};
+use crate::memory::Memory;
 use crate::outline::Outline;
 use crate::params::Budget;
 use crate::placement::Joint;

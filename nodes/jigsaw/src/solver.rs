@@ -1,9 +1,9 @@
 //! The incremental solver: pieces come and go, candidates are kept, a solution is made on demand.
 
-use crate::contact::Memory;
 use crate::correlation::correlate;
 use crate::index::{Entry, Index, Windows, shape_distance};
 use crate::matching::{List, Match};
+use crate::memory::Memory;
 use crate::outline::{Outline, Segment};
 use crate::paper;
 use crate::params::{Budget, Time};

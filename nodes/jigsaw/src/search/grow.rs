@@ -7,11 +7,14 @@
 use super::Assembler;
 use super::adjust::COARSE;
 use super::learn::{ACCEPT, STRONG, UNLEARNT, WORN};
-use crate::loops::{self, Said};
+use crate::loops::{self, Said, Tolerance};
 use std::collections::BTreeMap;
 
 /// Candidates of each mouth and tab that take part in growth.
 const GROWTH_RANKS: usize = 12;
+
+/// Poses farther apart than this are not weighed: no drift of an island accounts for it.
+const FAR: Tolerance = Tolerance { position: 0.25, angle: 0.25 };
 
 /// Candidates that agree on how two islands lie to each other, and the evidence for it.
 #[derive(Debug, Clone)]
@@ -95,6 +98,10 @@ impl Assembler<'_> {
         for (j, other) in candidates.iter().enumerate().filter(|(j, _)| *j != i) {
             let e = &self.edges[*other];
             let piece = if self.state.island(e.a) == moving { e.a } else { e.b };
+            let [p, q] = [i, j].map(|k| said[k].pose * self.state.pose[piece]);
+            if !FAR.allows(self.outlines[piece], &p, &q) {
+                continue;
+            }
             let distance = loops::disagreement(&said[i], &said[j], self.centre_of(piece));
             let slots = e.slots;
             let clashes = |g: &usize| {

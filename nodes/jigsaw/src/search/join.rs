@@ -7,7 +7,7 @@
 use super::Assembler;
 use super::adjust::COARSE;
 use crate::Policy;
-use crate::loops::{self, Tolerance, difference};
+use crate::loops::{self, Tolerance};
 use crate::placement;
 use crate::slots::Slot;
 use nalgebra::{Isometry2, Point2, Vector2};
@@ -78,8 +78,7 @@ impl Assembler<'_> {
     pub(super) fn agrees(&self, k: usize) -> bool {
         let e = &self.edges[k];
         let actual = self.state.pose[e.b].inverse() * self.state.pose[e.a];
-        let (d, turn) = difference(self.outlines[e.a], &actual, &e.b_from_a);
-        let within = |t: Tolerance| d <= t.position && turn <= t.angle;
+        let within = |t: Tolerance| t.allows(self.outlines[e.a], &actual, &e.b_from_a);
         within(MIN_AGREE)
             || (within(AGREE) && self.closure.admits(loops::deviation(e, &actual, self.outlines[e.a].centroid)))
     }

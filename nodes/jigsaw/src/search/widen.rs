@@ -2,12 +2,12 @@
 //!
 //! The index keeps the tabs that resemble a mouth most. In a large heap of worn pieces the right one may not be among
 //! them, or may have been outshone by one that has found its place since. Where little is left open few pairs remain, and
-//! each mouth is compared with many times as many of the tabs that are open as well. Complexity O(open mouths · tabs tried)
-//! rough poses, limited by [`TRIES`].
+//! each mouth is compared with many times as many of the tabs that are open as well, but only once as pieces come.
+//! Complexity O(open mouths · tabs tried) rough poses, limited by [`TRIES`].
 
 use super::learn::rank;
 use super::{Assembler, edge};
-use crate::index::{Entry, Index, Windows};
+use crate::index::{Entry, Hit, Index, Windows};
 use crate::loops::Edge;
 use crate::matching::{self, Match};
 use crate::placement::{Feet, Joint};
@@ -57,9 +57,16 @@ impl Assembler<'_> {
                     let pair = [self.slots.tab(a, tab), self.slots.mouth(b, mouth)];
                     self.state.island(a) != self.state.island(b) && !known.contains(&pair)
                 });
-                let mut list: Vec<Match> =
-                    hits.into_iter().map(|hit| Match::new(hit, segment, self.outlines, fit, feet)).collect();
+                let this = (outline.serial, mouth);
+                let isthmus = |hit: &Hit| (self.outlines[hit.piece as usize].serial, hit.tab as usize);
+                let mut seen = self.memory.matches(this);
+                let mut look = |hit: Hit| match seen.remove(&isthmus(&hit)) {
+                    Some(known) => known.again(hit),
+                    None => Match::new(hit, segment, self.outlines, fit, feet),
+                };
+                let mut list: Vec<Match> = hits.into_iter().map(&mut look).collect();
                 let fits = matching::refine(&mut list, segment, self.outlines, fit, feet);
+                self.memory.keep_matches(this, list.iter().map(|m| (isthmus(&m.hit), *m)).collect());
                 let joint = |(place, fit): (usize, _)| {
                     let hit = &list[place].hit;
                     Joint { a: hit.piece as usize, tab: hit.tab as usize, b, mouth, fit }
