@@ -1,7 +1,9 @@
 //! Solver node: shapes in, the assembly and the poses of the pieces out.
 //!
 //! Pieces are taken in as they come. When none has come for a short while (`settle_time`), the puzzle is solved in a
-//! worker thread; pieces that come meanwhile are taken in after it. Every solution is published, also a partial one.
+//! worker thread; pieces that come meanwhile are taken in after it. Every solution is published, also a partial one, but
+//! for one that nobody waits for any more: the last piece of the puzzle, or a reset, puts an end to the solution under
+//! way. Other pieces don't, or a puzzle whose pieces come faster than it is solved would show no assembly before the end.
 
 pub mod convert;
 pub mod journal;
@@ -9,12 +11,13 @@ pub mod params;
 
 use std::collections::HashMap;
 use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
 use futures::channel::{mpsc, oneshot};
 use futures::future::{Fuse, FusedFuture};
 use futures::{FutureExt, SinkExt, Stream, StreamExt, pin_mut};
-use jigsaw::{Assembly, Params, Piece, Solver, SolverError};
+use jigsaw::{Assembly, Budget, Params, Piece, Solver, SolverError};
 use jigsaw_msgs::action::{Assemble, AssembleFeedback, AssembleResult};
 use jigsaw_msgs::msg::{Assembly as AssemblyMessage, PieceFeatures};
 use jigsaw_msgs::sensor_msgs::msg::Image;
@@ -252,10 +255,53 @@ fn answer(call: Call<Trigger>, response: TriggerResponse) {
     let _ = call.reply.send(response);
 }
 
+/// Waits until no piece has come for the settle time.
+#[derive(Debug, Default)]
+struct Settling {
+    /// When the first of the pieces that wait came.
+    since: Option<Instant>,
+}
+
+impl Settling {
+    /// How many times the settle time a piece waits at most: pieces that keep coming must not put the solution off for ever.
+    const MOST: u32 = 4;
+
+    /// When to solve, after a piece has come now.
+    fn due(&mut self, now: Instant, settle_time: Duration) -> Instant {
+        let since = *self.since.get_or_insert(now);
+        (now + settle_time).min(since + settle_time * Self::MOST)
+    }
+}
+
+/// The time that a solution may take, and whether it is wanted still.
+struct Allowance {
+    begin: Instant,
+    /// \[s\]; 0 for no limit.
+    seconds: f64,
+    abandoned: Arc<AtomicBool>,
+}
+
+impl Allowance {
+    fn is_abandoned(&self) -> bool {
+        self.abandoned.load(Ordering::Relaxed)
+    }
+}
+
+impl Budget for Allowance {
+    fn spent(&self) -> f64 {
+        match self.seconds {
+            _ if self.is_abandoned() => f64::INFINITY,
+            limit if limit > 0.0 => self.begin.elapsed().as_secs_f64() / limit,
+            _ => 0.0,
+        }
+    }
+}
+
 /// What one run of the worker gives back.
 struct Done {
     solver: Option<Solver>,
-    assembly: Assembly,
+    /// None where it was abandoned.
+    assembly: Option<Assembly>,
     /// Pieces the solver did not take, with its reasons.
     refused: Vec<(String, String)>,
     generation: u64,
@@ -294,6 +340,10 @@ struct Table {
     sightings: HashMap<String, (u64, Sighting)>,
     /// When to solve next, if there is a reason to.
     due: Option<Instant>,
+    /// Pieces that wait to be solved together.
+    settling: Settling,
+    /// Whether the solution under way is of no use any more.
+    abandoned: Arc<AtomicBool>,
     /// Callers that wait for the next solution.
     waiting: Vec<Call<Trigger>>,
     /// Counts resets: what a worker began before one is of no use after it.
@@ -326,6 +376,8 @@ impl Table {
             incoming: Vec::new(),
             sightings: HashMap::new(),
             due: None,
+            settling: Settling::default(),
+            abandoned: Arc::default(),
             waiting: Vec::new(),
             generation: 0,
             transforms: TFMessage::default(),
@@ -398,14 +450,21 @@ impl Table {
                 }
                 self.health.received();
                 self.health.figure("pieces", self.sightings.len());
-                let settle_time = Duration::from_secs_f64(self.parameters.double(&params::SETTLE_TIME));
-                // With the last piece there is nothing to wait for.
-                let is_last = self.sightings.len() == self.expected_pieces();
-                self.due = Some(Instant::now() + if is_last { Duration::ZERO } else { settle_time });
+                self.due = Some(self.due_with_piece(Instant::now()));
             }
             Ok(false) => log::debug!("piece {} came again", message.id),
             Err(refusal) => self.health.refuse(refusal.kind(), &refusal.to_string()),
         }
+    }
+
+    /// When to solve, after a piece has come now.
+    fn due_with_piece(&mut self, now: Instant) -> Instant {
+        // With the last piece there is nothing to wait for, and a solution without it is of no use.
+        if self.sightings.len() == self.expected_pieces() {
+            self.abandoned.store(true, Ordering::Relaxed);
+            return now;
+        }
+        self.settling.due(now, Duration::from_secs_f64(self.parameters.double(&params::SETTLE_TIME)))
     }
 
     /// Whether the piece is new. The same message again (of a latched topic, or of a node that was started again) is not,
@@ -439,13 +498,16 @@ impl Table {
     /// The next run of the worker: takes in what has come, and solves.
     fn work(&mut self) -> impl FnOnce() -> Done + Send + 'static {
         self.due = None;
+        self.settling = Settling::default();
+        self.abandoned = Arc::default();
         self.health.state("solving");
         let params = params::solver_params(&self.parameters);
+        let abandoned = Arc::clone(&self.abandoned);
         let solver = self.solver.take();
         let incoming = std::mem::take(&mut self.incoming);
         let generation = self.generation;
         move || {
-            let start = Instant::now();
+            let allowance = Allowance { begin: Instant::now(), seconds: params.time_budget, abandoned };
             let mut refused = Vec::new();
             let mut solved = None;
             match with_params(solver, params) {
@@ -456,14 +518,14 @@ impl Table {
                             refused.push((id, e.to_string()));
                         }
                     }
-                    let assembly = solver.solve();
+                    let assembly = solver.solve_within(&allowance);
                     solved = Some((solver, assembly));
                 }
                 Err(e) => refused.extend(incoming.into_iter().map(|piece| (piece.id, e.to_string()))),
             }
             let (solver, assembly) = solved.unzip();
-            let assembly = assembly.unwrap_or_default();
-            Done { solver, assembly, refused, generation, seconds: start.elapsed().as_secs_f64() }
+            let assembly = (!allowance.is_abandoned()).then(|| assembly.unwrap_or_default());
+            Done { solver, assembly, refused, generation, seconds: allowance.begin.elapsed().as_secs_f64() }
         }
     }
 
@@ -481,13 +543,14 @@ impl Table {
         let pieces = done.solver.as_ref().map(|solver| solver.pieces().to_vec()).unwrap_or_default();
         let sightings = pieces.iter().filter_map(|p| self.sightings.get(&p.id).map(|(_, s)| s.clone())).collect();
         self.solver = done.solver;
+        let Some(assembly) = done.assembly else { return };
         if !self.activity.is_active() {
             // The node was told to stop while it solved; it solves again when it is told to go on.
             self.due = Some(Instant::now());
             return;
         }
         self.health.figure("solve_seconds", format!("{:.4}", done.seconds));
-        self.send(Solution { pieces, sightings, assembly: done.assembly, naming: self.naming() }).await;
+        self.send(Solution { pieces, sightings, assembly, naming: self.naming() }).await;
     }
 
     async fn publish_empty(&mut self) {
@@ -563,9 +626,11 @@ impl Table {
     /// Forgets all pieces, here and upstream: what is in view from now on is new.
     async fn reset(&mut self) {
         self.generation += 1;
+        self.abandoned.store(true, Ordering::Relaxed);
         self.incoming.clear();
         self.sightings.clear();
         self.due = None;
+        self.settling = Settling::default();
         self.transforms = TFMessage::default();
         self.solver = None;
         self.keep_journal(Journal::forget_all);
@@ -573,5 +638,32 @@ impl Table {
         let _ = self.outputs.resets.send(Empty::default()).await;
         // What is latched must not speak of pieces that are forgotten.
         self.publish_empty().await;
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn pieces_that_come_together_are_solved_together_and_none_waits_for_ever() {
+        let (begin, settle_time) = (Instant::now(), Duration::from_millis(10));
+        let mut settling = Settling::default();
+        assert_eq!(settling.due(begin, settle_time), begin + settle_time);
+        let next = begin + settle_time / 2;
+        assert_eq!(settling.due(next, settle_time), next + settle_time);
+        let stream = (0..100).map(|k| begin + k * settle_time / 2);
+        let latest = stream.map(|now| settling.due(now, settle_time)).max();
+        assert_eq!(latest, Some(begin + Settling::MOST * settle_time));
+    }
+
+    #[test]
+    fn a_solution_that_nobody_waits_for_has_no_time_left() {
+        let abandoned = Arc::new(AtomicBool::new(false));
+        let allowance = |seconds| Allowance { begin: Instant::now(), seconds, abandoned: Arc::clone(&abandoned) };
+        let (unlimited, limited) = (allowance(0.0), allowance(3600.0));
+        assert!(unlimited.spent() == 0.0 && limited.spent() < 0.5);
+        abandoned.store(true, Ordering::Relaxed);
+        assert!(unlimited.spent() >= 1.0 && limited.spent() >= 1.0);
     }
 }

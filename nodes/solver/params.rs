@@ -83,7 +83,7 @@ pub const SETTLE_TIME: Spec = Spec {
     default: Default::Double(0.005),
     unit: "s",
     rule: Rule::Doubles(0.0, 10.0),
-    description: "Time without a new piece after which is solved; pieces that come together are solved together.",
+    description: "Time without a new piece after which is solved, four times it at most; pieces that come together are solved together.",
     read_only: false,
 };
 
