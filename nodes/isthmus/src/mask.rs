@@ -14,7 +14,7 @@
 //!    divided by the local contrast. Pixels beyond half-way are joined to components once more: neighbours whose shadows
 //!    or glow met come apart.
 //! 5. *Rejection*, each with its [`Reason`]: cut by the frame's edge, too small beside the others, thread-like (hairs,
-//!    scanner edges), faint (glare), two shapes that touch (of about twice the usual area, with an isthmus between the halves). Where that
+//!    scanner edges), faint without a crisp edge (glare), two shapes that touch (of about twice the usual area, with an isthmus between the halves). Where that
 //!    isthmus is too narrow to be the neck of one of them they are cut apart instead ([`Segmentation::separated`]).
 //!
 //! # Cost

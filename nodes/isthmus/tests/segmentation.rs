@@ -166,6 +166,29 @@ fn light_from_one_side() {
     check(&grey(&pixels), &necks, "light from one side");
 }
 
+/// A piece with dark print among bright ones, on black: an eighth of their contrast, and a crisp edge; beside it a glow of the same contrast that
+/// falls off slowly.
+#[test]
+fn a_dark_piece_among_bright_ones_is_no_glare() {
+    let outlines: Vec<_> = CENTRES
+        .into_iter()
+        .enumerate()
+        .map(|(k, (x, y))| Piece::random(SIZE, 10 + k as u64).outline(&pose(0.3, 1.0, x, y)))
+        .collect();
+    let camera = Camera { width: SIDE, height: SIDE, shape_level: 1.0, ground_level: 0.0, ..Camera::default() };
+    let camera = |level| Camera { shape_level: level, noise: 2.0, ..camera };
+    let [bright, dark] = [(&outlines[..3], 180.0), (&outlines[3..], 24.0)].map(|(o, level)| camera(level).picture(o));
+    let mut pixels: Vec<u8> = bright.iter().zip(&dark).map(|(b, d)| 10 + (*b).max(*d)).collect();
+    let found = grey(&pixels);
+    assert_eq!(found.cutouts.len(), 4, "{:?}", found.rejected);
+    // The glow in place of the dark piece.
+    pixels = bright.iter().map(|b| 10 + b).collect();
+    disc(&mut pixels, CENTRES[3], 180.0, |p, r| p + (30.0 * (1.0 - r * r)) as u8);
+    let found = grey(&pixels);
+    assert_eq!(found.cutouts.len(), 3);
+    assert!(found.rejected.iter().any(|r| r.reason == Reason::Faint), "{:?}", found.rejected);
+}
+
 #[test]
 fn specks_and_hairs() {
     let (mut pixels, necks) = scene(Camera { noise: 3.0, ..Camera::default() });

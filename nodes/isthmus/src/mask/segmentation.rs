@@ -11,7 +11,7 @@ pub struct Parameters {
     /// Least area as a part of the frame's typical shape (the one that half of all shape area is in shapes at least as
     /// large as). Default 0.2: pieces of one puzzle differ by less; printed labels and crumbs are smaller.
     pub min_relative_area: f64,
-    /// Least contrast as a part of the frame's typical shape. Default 0.2: glare and shadows have less.
+    /// Least contrast as a part of the frame's typical shape, of what has no crisp edge. Default 0.2: glare and shadows have less.
     pub min_relative_contrast: f64,
     /// Least part of its bounding box that a shape fills. Default 0.08: hairs and scanner edges fill less.
     pub min_fill: f64,
@@ -33,7 +33,7 @@ pub enum Reason {
     Small,
     /// It is a thread: a hair, the edge of the scanner's glass.
     Thread,
-    /// It differs far less from the ground than the other shapes: glare, a shadow.
+    /// It differs far less from the ground than the other shapes, and without a crisp edge: glare, a shadow.
     Faint,
     /// Two shapes touch.
     Touching,

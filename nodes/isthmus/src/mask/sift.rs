@@ -31,6 +31,15 @@ const TOUCHING_WIDTH: f64 = 0.35;
 /// would keep the other's tab.
 const SEPARABLE_WIDTH: f64 = 0.1;
 
+/// How far on either side of a border levels are compared to tell a crisp edge, as a part of the square root of the shape's area: light that falls off
+/// from a spot's middle to its rim does so little there.
+const EDGE_REACH: f64 = 0.05;
+/// ... at least and at most, in pixels: beyond the blur of usual pictures, and within the margin of a cutout.
+const MIN_EDGE_REACH: f64 = 2.0;
+const MAX_EDGE_REACH: f64 = 6.0;
+/// Least part of a shape's contrast that a crisp edge has within that reach: a spot of light has a sixth, an edge in focus all.
+const CRISP_EDGE: f64 = 0.6;
+
 /// A shape that may still be rejected beside the others.
 pub(super) struct Found {
     pub(super) cutout: Cutout,
@@ -77,7 +86,9 @@ pub(super) fn sift(
             && f.area as f64 >= TIGHT_SHARE * total as f64;
         let reason = if (f.area as f64) < parameters.min_relative_area * typical_area as f64 {
             Some(Reason::Small)
-        } else if f64::from(f.contrast) < parameters.min_relative_contrast * f64::from(typical_contrast) {
+        } else if f64::from(f.contrast) < parameters.min_relative_contrast * f64::from(typical_contrast)
+            && !has_crisp_edge(&f.cutout)
+        {
             Some(Reason::Faint)
         } else if f.contact > 0 && !tight {
             Some(Reason::CutByFrame)
@@ -104,6 +115,28 @@ pub(super) fn sift(
     cutouts.sort_by_key(|c| (c.aoi.y, c.aoi.x));
     rejected.sort_by_key(|r| (r.aoi.y, r.aoi.x));
     Segmentation { cutouts, rejected, separated }
+}
+
+/// Whether the level falls off at the border of a shape rather than all over it: the edge of a piece, however faint, does, those of glare and
+/// shadows don't.
+fn has_crisp_edge(cutout: &Cutout) -> bool {
+    let Ok((border, _)) = Border::from_cutout(cutout) else { return false };
+    let reach = (EDGE_REACH * border.area().sqrt()).clamp(MIN_EDGE_REACH, MAX_EDGE_REACH);
+    let (width, height) = (cutout.window.width as i32, cutout.window.height as i32);
+    let level = |p: Point| {
+        let (x, y) = (p.x.round() as i32 - cutout.window.x, p.y.round() as i32 - cutout.window.y);
+        f64::from(cutout.pixels[(y.clamp(0, height - 1) * width + x.clamp(0, width - 1)) as usize])
+    };
+    let points = &border.points;
+    let n = points.len();
+    let step = |k: usize| {
+        let along = (points[(k + 1) % n] - points[(k + n - 1) % n]).normalize();
+        // Clockwise on a screen, y down: the shape is on the right.
+        let inwards = reach * nalgebra::Vector2::new(-along.y, along.x);
+        level(points[k] + inwards) - level(points[k] - inwards)
+    };
+    let mean = (0..n).map(step).sum::<f64>() / n as f64;
+    mean / f64::from(cutout.shape_level - cutout.ground_level) >= CRISP_EDGE
 }
 
 /// The narrowest place at which two shapes of about a given area each touch: an isthmus with most of a shape on either side.
