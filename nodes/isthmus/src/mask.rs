@@ -12,7 +12,7 @@
 //! 4. *Pixels*: about each component the frame is cut out, in a form in which half-way between two fixed levels is half-way
 //!    between the shape's own level near the border and the ground's: as it is, where both are uniform, else
 //!    divided by the local contrast. Pixels beyond half-way are joined to components once more: neighbours whose shadows
-//!    or glow met come apart.
+//!    or glow met come apart. Threads that hang on a shape (hairs) are taken off.
 //! 5. *Rejection*, each with its [`Reason`]: cut by the frame's edge, too small beside the others, thread-like (hairs,
 //!    scanner edges), faint without a crisp edge (glare), two shapes that touch (of about twice the usual area, with an isthmus between the halves). Where that
 //!    isthmus is too narrow to be the neck of one of them they are cut apart instead ([`Segmentation::separated`]).
@@ -125,6 +125,9 @@ impl Segmenter {
             }
             self.crop.take(frame, &standing, k);
             self.crop.label(&mut self.fine);
+            if self.crop.erase_threads(&self.fine, parameters) {
+                self.crop.label(&mut self.fine);
+            }
             self.collect(frame, parameters, &mut found, &mut rejected);
         }
         sift(frame, parameters, found, rejected)

@@ -210,6 +210,25 @@ fn specks_and_hairs() {
     assert!(found.rejected.iter().any(|r| r.reason == Reason::Thread), "{:?}", found.rejected);
 }
 
+/// Hairs of two pixels across the pieces, two of which one of them joins.
+#[test]
+fn hairs_on_the_pieces() {
+    let (mut pixels, necks) = scene(Camera { noise: 3.0, ..Camera::default() });
+    let [a, b, c, _] = CENTRES;
+    for ([(x, y), (u, v)], bend) in [([a, b], 30.0), ([c, (c.0 + 150.0, c.1 + 230.0)], 12.0), ([b, (890.0, 40.0)], 8.0)]
+    {
+        let steps = 2 * SIDE;
+        for t in (0..=steps).map(|i| i as f64 / steps as f64) {
+            let across = bend * (7.0 * t).sin();
+            let (p, q) = ((x + t * (u - x)) as usize, (y + t * (v - y) + across) as usize);
+            for row in q..q + 2 {
+                pixels[row * SIDE + p..row * SIDE + p + 2].fill(60);
+            }
+        }
+    }
+    check(&grey(&pixels), &necks, "hairs");
+}
+
 #[test]
 fn a_piece_that_the_frame_cuts_is_named() {
     let outlines: Vec<_> = [(230.0, 240.0), (650.0, 220.0), (240.0, 660.0), (880.0, 650.0)]

@@ -26,6 +26,22 @@ pub(super) struct Component {
     pub(super) bottom: usize,
 }
 
+/// How far beyond an opening the body of a component may reach, in pixels: its corners, and what noise adds to its edge.
+const BODY_END: usize = 2;
+
+/// Least length of a thread beyond that, in widths: what is shorter may be a sharp corner.
+const THREAD_LENGTH: usize = 4;
+
+/// What two lists of spans have in common; both rise and have no overlap in themselves.
+fn common(a: &[[usize; 2]], b: &[[usize; 2]]) -> Vec<[usize; 2]> {
+    let mut both = Vec::with_capacity(a.len());
+    for [from, to] in a {
+        let overlaps = b.iter().map(|[s, e]| [*s.max(from), *e.min(to)]);
+        both.extend(overlaps.filter(|[s, e]| s < e));
+    }
+    both
+}
+
 /// Runs and components, filled row by row.
 #[derive(Debug, Clone, Default)]
 pub(super) struct Components {
@@ -74,6 +90,70 @@ impl Components {
         if let Some(from) = start {
             self.push(from, row.len());
         }
+    }
+
+    /// What of a component is at most `2 reach` pixels wide and leads far away from its body: what an opening with a square takes away (G. Matheron,
+    /// *Random sets and integral geometry*, 1975), the body's own corners aside.
+    pub(super) fn threads(&self, label: usize, reach: usize) -> Vec<Run> {
+        let Some(c) = self.list.get(label) else { return Vec::new() };
+        let rows = self.filled(label, c);
+        let near = |row: usize, reach: usize| row.saturating_sub(reach)..rows.len().min(row + reach + 1);
+        let shrunk = |spans: &[[usize; 2]]| -> Vec<[usize; 2]> {
+            spans.iter().map(|[start, end]| [start + reach, end.saturating_sub(reach)]).filter(|[s, e]| s < e).collect()
+        };
+        let narrow: Vec<Vec<[usize; 2]>> = rows.iter().map(|spans| shrunk(spans)).collect();
+        let core = |row: usize| {
+            let whole = row >= reach && row + reach < rows.len();
+            let begin = if whole { narrow[row].clone() } else { Vec::new() };
+            narrow[near(row, reach)].iter().fold(begin, |core, spans| common(&core, spans))
+        };
+        let core: Vec<Vec<[usize; 2]>> = (0..rows.len()).map(core).collect();
+        let grown = reach + BODY_END;
+        let mut threads = Self::default();
+        for (row, spans) in rows.iter().enumerate() {
+            let around = core[near(row, grown)].iter().flatten();
+            let mut body: Vec<[usize; 2]> = around.map(|[s, e]| [s.saturating_sub(grown), e + grown]).collect();
+            body.sort_unstable();
+            threads.begin_row(c.top + row);
+            for &[first, end] in spans {
+                let mut start = first;
+                for [from, to] in body.iter().copied().chain([[end, end]]) {
+                    if start < from.min(end) {
+                        threads.push(start, from.min(end));
+                    }
+                    start = start.max(to);
+                }
+            }
+        }
+        threads.close();
+        let is_long = |t: &Component| (t.right - t.left).max(t.bottom - t.top) >= THREAD_LENGTH * 2 * reach;
+        threads.runs.iter().filter(|run| is_long(&threads.list[run.label])).copied().collect()
+    }
+
+    /// The spans of a component row by row, its holes filled: a strip that is split off a shape's edge, but not its ends, is no thread.
+    fn filled(&self, label: usize, c: &Component) -> Vec<Vec<[usize; 2]>> {
+        let mut rows: Vec<Vec<[usize; 2]>> = vec![Vec::new(); c.bottom - c.top];
+        self.runs_of(label).for_each(|run| rows[run.row - c.top].push([run.start, run.end]));
+        let mut gaps = Self::default();
+        for (row, spans) in rows.iter().enumerate() {
+            gaps.begin_row(row);
+            let ends = std::iter::once(c.left).chain(spans.iter().map(|s| s[1]));
+            let starts = spans.iter().map(|s| s[0]).chain([c.right]);
+            ends.zip(starts).filter(|(from, to)| from < to).for_each(|(from, to)| gaps.push(from, to));
+        }
+        gaps.close();
+        let end = rows.len();
+        let is_hole = |g: &Component| g.left > c.left && g.right < c.right && g.top > 0 && g.bottom < end;
+        for gap in gaps.runs.iter().filter(|gap| is_hole(&gaps.list[gap.label])) {
+            let spans = &mut rows[gap.row];
+            if let Some(after) = spans.iter().position(|span| span[0] == gap.end)
+                && after > 0
+            {
+                spans[after - 1][1] = spans[after][1];
+                spans.remove(after);
+            }
+        }
+        rows
     }
 
     fn push(&mut self, start: usize, end: usize) {

@@ -15,11 +15,14 @@ pub struct Parameters {
     pub min_relative_contrast: f64,
     /// Least part of its bounding box that a shape fills. Default 0.08: hairs and scanner edges fill less.
     pub min_fill: f64,
+    /// Greatest width of the threads that are taken off a shape, as a part of the square root of its area (and up to 6 px). Default 0.016: hairs are
+    /// thinner beside a puzzle's pieces, necks wider by far. 0 for shapes whose own branches may be that thin.
+    pub max_thread: f64,
 }
 
 impl Default for Parameters {
     fn default() -> Self {
-        Self { min_area: 256, min_relative_area: 0.2, min_relative_contrast: 0.2, min_fill: 0.08 }
+        Self { min_area: 256, min_relative_area: 0.2, min_relative_contrast: 0.2, min_fill: 0.08, max_thread: 0.016 }
     }
 }
 
