@@ -32,14 +32,15 @@ const BODY_END: usize = 2;
 /// Least length of a thread beyond that, in widths: what is shorter may be a sharp corner.
 const THREAD_LENGTH: usize = 4;
 
-/// What two lists of spans have in common; both rise and have no overlap in themselves.
-fn common(a: &[[usize; 2]], b: &[[usize; 2]]) -> Vec<[usize; 2]> {
-    let mut both = Vec::with_capacity(a.len());
-    for [from, to] in a {
-        let overlaps = b.iter().map(|[s, e]| [*s.max(from), *e.min(to)]);
-        both.extend(overlaps.filter(|[s, e]| s < e));
+/// Keeps of spans what they have in common with others; both rise, without overlap among themselves.
+fn keep_common(spans: &mut Vec<[usize; 2]>, others: &[[usize; 2]]) {
+    let common = |[from, to]: [usize; 2], [s, e]: [usize; 2]| [from.max(s), to.min(e)];
+    if let ([span], [other]) = (&mut spans[..], others) {
+        *span = common(*span, *other);
+    } else {
+        *spans = spans.iter().flat_map(|span| others.iter().map(|other| common(*span, *other))).collect();
     }
-    both
+    spans.retain(|[from, to]| from < to);
 }
 
 /// Runs and components, filled row by row.
@@ -104,17 +105,25 @@ impl Components {
         let narrow: Vec<Vec<[usize; 2]>> = rows.iter().map(|spans| shrunk(spans)).collect();
         let core = |row: usize| {
             let whole = row >= reach && row + reach < rows.len();
-            let begin = if whole { narrow[row].clone() } else { Vec::new() };
-            narrow[near(row, reach)].iter().fold(begin, |core, spans| common(&core, spans))
+            let mut core = if whole { narrow[row].clone() } else { Vec::new() };
+            narrow[near(row, reach)].iter().for_each(|spans| keep_common(&mut core, spans));
+            core
         };
         let core: Vec<Vec<[usize; 2]>> = (0..rows.len()).map(core).collect();
         let grown = reach + BODY_END;
         let mut threads = Self::default();
         for (row, spans) in rows.iter().enumerate() {
+            threads.begin_row(c.top + row);
+            // The usual row: its body reaches from end to end.
+            if let ([[from, to]], [[start, end]]) = (&core[row][..], &spans[..])
+                && from.saturating_sub(grown) <= *start
+                && to + grown >= *end
+            {
+                continue;
+            }
             let around = core[near(row, grown)].iter().flatten();
             let mut body: Vec<[usize; 2]> = around.map(|[s, e]| [s.saturating_sub(grown), e + grown]).collect();
             body.sort_unstable();
-            threads.begin_row(c.top + row);
             for &[first, end] in spans {
                 let mut start = first;
                 for [from, to] in body.iter().copied().chain([[end, end]]) {
