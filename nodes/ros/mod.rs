@@ -13,6 +13,7 @@
 //! | [`lifecycle`] | states and transitions of a managed node |
 //! | `security` | keystore and enclave of SROS2 |
 //! | `server` | one service: requests in, answers out |
+//! | `large` | answers that do not fit a datagram |
 //! | `missed` | asks a client's writer for the request that came before it was known |
 //! | [`topics`] | every topic: message type, name, quality of service |
 //! | [`raw`] | topics whose type is known by name only |
@@ -32,6 +33,7 @@ pub mod args;
 mod farewell;
 pub mod health;
 pub mod kept;
+mod large;
 pub mod lifecycle;
 pub mod logging;
 mod missed;

@@ -324,6 +324,7 @@ impl Process {
             names,
             executor: Rc::clone(&self.executor),
             endpoints: self.endpoints.clone(),
+            secured: self.farewell.is_none(),
             parameters: table,
             health,
             clock: Clock::default(),

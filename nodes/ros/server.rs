@@ -10,6 +10,7 @@ use std::rc::Rc;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
+use byteorder::LittleEndian;
 use futures::channel::{mpsc, oneshot};
 use futures::stream::FuturesUnordered;
 use futures::{FutureExt, SinkExt, StreamExt};
@@ -17,13 +18,14 @@ use jigsaw_msgs::{Message, Service};
 use ros2_client::{MessageInfo, RmwRequestId, Subscription};
 use rustdds::no_key::DataWriter;
 use rustdds::{
-    CDRSerializerAdapter, DataWriterStatus, GUID, QosPolicies, SampleIdentity, SequenceNumber, StatusEvented,
-    Timestamp, TopicKind, WriteOptionsBuilder,
+    CDRSerializerAdapter, DataWriterStatus, DomainParticipant, GUID, QosPolicies, SampleIdentity, SequenceNumber,
+    StatusEvented, Timestamp, TopicKind, WriteOptionsBuilder,
 };
 use serde::Serialize;
 use serde::de::DeserializeOwned;
 
 use super::health::Health;
+use super::large;
 use super::session::{CHANNEL_DEPTH, Call, Session, SessionError};
 use super::topics::SERVICE_QOS;
 
@@ -82,7 +84,14 @@ impl Session {
         let publisher = participant.create_publisher(&policies).map_err(fail)?;
         let answers = publisher.create_datawriter_no_key(&answers, None).map_err(fail)?;
         let (sender, receiver) = mpsc::channel(CHANNEL_DEPTH);
-        let server = Server { name: name.to_owned(), requests, answers, health: Arc::clone(&self.health) };
+        let server = Server {
+            name: name.to_owned(),
+            requests,
+            answers,
+            participant: participant.clone(),
+            secured: self.secured,
+            health: Arc::clone(&self.health),
+        };
         self.spawn(server.attend(sender, call));
         Ok(receiver)
     }
@@ -92,6 +101,8 @@ struct Server<Req, Resp: Serialize> {
     name: String,
     requests: Subscription<Req>,
     answers: DataWriter<Resp, CDRSerializerAdapter<Resp>>,
+    participant: DomainParticipant,
+    secured: bool,
     health: Arc<Health>,
 }
 
@@ -160,8 +171,16 @@ impl<Req: DeserializeOwned + 'static, Resp: Serialize + 'static> Server<Req, Res
             // The answers to others would crowd those to it out of its queue, which holds ten.
             options = options.to_single_reader(client);
         }
-        if let Err(e) = self.answers.async_write_with_options(answer, options.build()).await {
-            self.health.warn("write", &format!("the answer of {} was not written: {}", self.name, e.forget_data()));
+        let content = cdr_encoding::to_vec::<_, LittleEndian>(&answer).unwrap_or_default();
+        match self.answers.async_write_with_options(answer, options.build()).await {
+            // In the clear, so not where others must not read it.
+            Ok(written) if content.len() > large::FRAGMENT.into() && !self.secured => {
+                large::send(&self.participant, written, SampleIdentity::from(request), &content);
+            }
+            Ok(_) => {}
+            Err(e) => {
+                self.health.warn("write", &format!("the answer of {} was not written: {}", self.name, e.forget_data()));
+            }
         }
     }
 }

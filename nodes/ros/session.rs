@@ -178,6 +178,8 @@ pub struct Session {
     pub(super) names: NodeNames,
     pub(super) executor: Rc<smol::LocalExecutor<'static>>,
     pub(super) endpoints: Endpoints,
+    /// Whether what goes out is encrypted.
+    pub(super) secured: bool,
     /// The parameters, served while the process lives.
     pub parameters: Arc<Parameters>,
     /// The counters, published while the process lives.

@@ -1,5 +1,9 @@
 """Parameters of the nodes, through the standard services, from rclpy."""
 
+import os
+import subprocess
+import sys
+
 import pytest
 from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
 from rcl_interfaces.srv import (
@@ -10,6 +14,8 @@ from rcl_interfaces.srv import (
     SetParameters,
     SetParametersAtomically,
 )
+
+from conftest import EVENT_TIMEOUT
 
 NODES = ("capture_node", "feature_node", "solver_node")
 
@@ -121,3 +127,35 @@ def test_values_from_the_command_line_and_a_file(launcher, ros, tmp_path):
 
     launcher.start("capture_node", "--ros-args", "-r", "__node:=other", "-p", "metres_per_pixel:=0.0004")
     assert Remote(ros, "other").get("metres_per_pixel")[0].double_value == 0.0004
+
+
+# A client that knows every interface of this host, as one without a profile does: answers come to it in the datagrams
+# of a network.
+CLIENT = """
+import sys
+import rclpy
+from lifecycle_msgs.srv import GetAvailableTransitions
+from rcl_interfaces.srv import DescribeParameters, ListParameters
+
+rclpy.init(domain_id=int(sys.argv[1]))
+node = rclpy.create_node("client")
+
+def call(service, name, **request):
+    client = node.create_client(service, f"/solver_node/{name}")
+    client.wait_for_service()
+    future = client.call_async(service.Request(**request))
+    rclpy.spin_until_future_complete(node, future)
+    return future.result()
+
+names = call(ListParameters, "list_parameters").result.names
+described = call(DescribeParameters, "describe_parameters", names=names).descriptors
+assert [one.name for one in described] == names and all(one.description for one in described)
+assert len(call(GetAvailableTransitions, "get_transition_graph").available_transitions) > 20
+"""
+
+
+def test_answers_larger_than_a_datagram_reach_a_client_on_any_interface(launcher, domain):
+    launcher.start("solver_node")
+    environment = {k: v for k, v in os.environ.items() if k != "FASTDDS_DEFAULT_PROFILES_FILE"}
+    environment |= {"FASTDDS_BUILTIN_TRANSPORTS": "UDPv4", "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
+    subprocess.run([sys.executable, "-c", CLIENT, str(domain)], env=environment, timeout=EVENT_TIMEOUT, check=True)
