@@ -44,6 +44,7 @@ mod runs;
 mod segmentation;
 mod sift;
 mod standing;
+mod threads;
 
 pub use crate::cutout::{Aoi, Cutout};
 pub use frame::{Frame, MAX_SIDE, MaskError, PixelFormat};
@@ -54,6 +55,7 @@ use ground::{Blocks, Ground};
 use runs::Components;
 use sift::{Found, sift};
 use standing::Standing;
+use threads::Threads;
 
 /// Finds the shapes of a frame.
 #[must_use]
@@ -71,6 +73,7 @@ pub struct Segmenter {
     owner: Vec<u32>,
     residual: Vec<f32>,
     crop: Crop,
+    threads: Threads,
 }
 
 impl Segmenter {
@@ -125,7 +128,7 @@ impl Segmenter {
             }
             self.crop.take(frame, &standing, k);
             self.crop.label(&mut self.fine);
-            if self.crop.erase_threads(&self.fine, parameters) {
+            if self.crop.erase_threads(&self.fine, &mut self.threads, parameters) {
                 self.crop.label(&mut self.fine);
             }
             self.collect(frame, parameters, &mut found, &mut rejected);

@@ -6,6 +6,7 @@ use super::levels::{Levels, RowSource};
 use super::runs::{Component, Components};
 use super::segmentation::Parameters;
 use super::standing::{NOBODY, Standing};
+use super::threads::Threads;
 use crate::Point;
 use crate::cutout::{Aoi, Cutout};
 
@@ -162,7 +163,12 @@ impl Crop {
     }
 
     /// Makes ground of the threads that hang on the shapes found: hairs, fluff; whether there are any. To be labelled again then.
-    pub(super) fn erase_threads(&mut self, components: &Components, parameters: &Parameters) -> bool {
+    pub(super) fn erase_threads(
+        &mut self,
+        components: &Components,
+        threads: &mut Threads,
+        parameters: &Parameters,
+    ) -> bool {
         if self.noise_level > MAX_THREAD_NOISE * (self.shape_level - self.ground_level).abs() {
             return false;
         }
@@ -173,7 +179,7 @@ impl Crop {
             if reach == 0 {
                 continue;
             }
-            for run in components.threads(label, reach) {
+            for run in threads.find(components, label, reach) {
                 any = true;
                 let columns = run.start.saturating_sub(THREAD_BLUR)..self.width.min(run.end + THREAD_BLUR);
                 for row in run.row.saturating_sub(THREAD_BLUR)..self.height.min(run.row + THREAD_BLUR + 1) {
