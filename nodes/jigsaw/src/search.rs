@@ -91,6 +91,8 @@ struct Assembler<'a> {
     /// What true and false candidates cost, and whether that is known from this puzzle.
     model: Model,
     learnt: bool,
+    /// Logarithm of the odds that what belongs in a mouth is there at all.
+    present: f64,
     /// How loops close.
     closure: Closure,
     /// Pieces that wait: copies of others, until those are placed.
@@ -144,6 +146,7 @@ pub(crate) fn assemble(
             wrong: ((1.5 * noise + 0.01 * scale).ln(), 0.5),
         },
         learnt: false,
+        present: 0.0,
         closure: Closure::guess(0.02, 1.0),
         aside: vec![false; n],
         state: State::new(n, &slots),
@@ -187,8 +190,7 @@ impl Assembler<'_> {
         // Of pieces that are there twice one makes the puzzle: two would take each other's place.
         self.aside = copies(self.outlines);
         self.model = self.first_model();
-        let outstanding = self.outstanding();
-        self.learn(&outstanding);
+        self.learn_from_outstanding();
         let found = if self.params.loops { self.close_loops() } else { Vec::new() };
         self.islands(&found);
         let trusted: Vec<usize> = self.state.joined().to_vec();

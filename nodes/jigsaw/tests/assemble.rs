@@ -50,6 +50,35 @@ fn incomplete_and_mixed_heaps_make_no_wrong_mating() {
     }
 }
 
+/// Of a heap from which most pieces are missing, the best candidate of most mouths is wrong, and the few that stand out
+/// don't say how good wrong ones can be.
+#[test]
+fn what_is_missing_makes_nothing_else_fit() {
+    let frame = Some([300, 300]);
+    let options = Options {
+        rows: 8,
+        columns: 12,
+        seed: 905,
+        similarity: 0.7,
+        noise: 8.0,
+        blur: 1.5,
+        clearance: [1.0, 1.0],
+        frame,
+        ..Options::default()
+    };
+    let puzzle = Puzzle::generate(&options).expect("valid options");
+    let pieces = puzzle.seen().expect("a piece in each frame");
+    // Every seventh piece, from one in the middle on, round the puzzle.
+    let mut solver = Solver::new(Params::default()).expect("valid parameters");
+    for k in 0..40 {
+        solver.insert(pieces[(7 * k + 25) % pieces.len()].clone()).expect("unique ids");
+    }
+    let assembly = solver.solve();
+    let score = puzzle.score(solver.pieces(), &assembly);
+    assert_eq!(score.wrong_matings, 0, "{score:?}");
+    assert!(score.right_matings > 0, "{score:?}");
+}
+
 /// What an arm is told while pieces still come in is as little wrong as what it is told in the end.
 #[test]
 fn nothing_is_wrong_on_the_way() {

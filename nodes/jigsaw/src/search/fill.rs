@@ -294,7 +294,7 @@ impl Assembler<'_> {
         const NORMAL_90: f64 = 1.2816;
         let placed: Vec<usize> = (0..self.outlines.len()).filter(|k| self.counts(*k, island)).collect();
         let sample: Vec<usize> = placed.iter().copied().step_by(placed.len().div_ceil(SAMPLE).max(1)).collect();
-        let mut right: Vec<f64> = sample.par_iter().filter_map(|k| Some(self.misfit_of(*k)?.cost)).collect();
+        let mut right: Vec<f64> = sample.par_iter().filter_map(|k| self.cost_of_placed(*k)).collect();
         if right.len() < FEW {
             return None;
         }

@@ -69,7 +69,7 @@ pub(super) struct Place {
 pub(super) struct Misfit {
     /// Logarithm of the mean gap.
     pub(super) cost: f64,
-    /// Part of the border that has another near.
+    /// Part of the border that has another near, at first sight: how enclosed the place is.
     pub(super) share: f64,
     /// Greatest overlap with another piece, in squared piece scales.
     pub(super) overlap: f64,
@@ -140,17 +140,21 @@ impl Assembler<'_> {
             return Some((place.pose, out));
         }
         let pose = self.settled(place);
-        let misfit = |step: f64| self.misfit(place.piece, &place.beside, &pose, step);
-        if most.is_finite() && misfit(GLANCE * COARSE).is_some_and(|m| m.cost > most + DOUBT) {
+        let seen = self.seen_from(&place.beside, &pose);
+        if most.is_finite()
+            && self.gap_cost(place.piece, &seen, GLANCE * COARSE).is_some_and(|cost| cost > most + DOUBT)
+        {
             return Some((pose, out));
         }
-        Some((pose, misfit(COARSE)?))
+        let cost = self.gap_cost(place.piece, &seen, COARSE)?;
+        Some((pose, Misfit { cost, share: place.share, overlap: self.greatest_overlap(place.piece, &seen) }))
     }
 
-    /// How badly a piece fits where it lies.
-    pub(super) fn misfit_of(&self, piece: usize) -> Option<Misfit> {
+    /// What a piece costs where it lies.
+    pub(super) fn cost_of_placed(&self, piece: usize) -> Option<f64> {
         let pose = &self.state.pose[piece];
-        self.misfit(piece, &self.beside(piece, self.state.island(piece), None, pose), pose, COARSE)
+        let beside = self.beside(piece, self.state.island(piece), None, pose);
+        self.gap_cost(piece, &self.seen_from(&beside, pose), COARSE)
     }
 
     /// Pieces of an island, but for those away, near enough to touch a piece in a pose, or in one a little off.
@@ -214,12 +218,12 @@ impl Assembler<'_> {
         pose
     }
 
-    /// How badly a piece fits in a pose, looked at from a point each `step` scales; `None` where it hardly touches anything.
-    fn misfit(&self, piece: usize, beside: &[usize], pose: &Isometry2<f64>, step: f64) -> Option<Misfit> {
+    /// Logarithm of the mean gap of a piece to others from which it is seen in some poses, looked at from a point each
+    /// `step` scales; `None` where it hardly touches any.
+    fn gap_cost(&self, piece: usize, seen: &[(usize, Isometry2<f64>)], step: f64) -> Option<f64> {
         let outline = self.outlines[piece];
         let stride = ((outline.scale * step / outline.spacing) as usize).max(1);
         let (near, cap) = (NEAR * self.scale, CAP * self.scale);
-        let seen = self.seen_from(beside, pose);
         let touch = |(p, own): (&Point, &Vector2<f32>)| {
             let gaps = seen.iter().filter_map(|(q, q_from_piece)| {
                 let (gap, normal) = self.outlines[*q].gap(q_from_piece * p, near)?;
@@ -232,15 +236,12 @@ impl Assembler<'_> {
         };
         let touches: Vec<Touch> =
             outline.points.iter().zip(&outline.normals).step_by(stride).filter_map(touch).collect();
-        let share = touches.len() as f64 / outline.points.len().div_ceil(stride) as f64;
-        if share < LEAST_SHARE {
+        if (touches.len() as f64) < LEAST_SHARE * outline.points.len().div_ceil(stride) as f64 {
             return None;
         }
         let mut gaps: Vec<f64> = unstrained(&touches).into_iter().map(|g| g.abs().min(cap)).collect();
         gaps.sort_by(f64::total_cmp);
         gaps.truncate((FOLLOWS * gaps.len() as f64).ceil() as usize);
-        let sum: f64 = gaps.iter().sum();
-        let overlap = self.greatest_overlap(piece, &seen);
-        Some(Misfit { cost: (sum / gaps.len() as f64).max(1e-4).ln(), share, overlap })
+        Some((gaps.iter().sum::<f64>() / gaps.len() as f64).max(1e-4).ln())
     }
 }

@@ -78,7 +78,8 @@ impl Assembler<'_> {
         }
         let least = if self.learnt { ACCEPT } else { UNLEARNT };
         // A candidate must be likely by itself, and lead whatever else would take its place.
-        let acceptable = grouped.values().filter(|g| g.evidence >= least && self.lead(g, &grouped) >= ACCEPT);
+        let likely = |g: &&Group| g.evidence + if g.members.len() > 1 { 0.0 } else { self.present } >= least;
+        let acceptable = grouped.values().filter(likely).filter(|g| self.lead(g, &grouped) >= ACCEPT);
         acceptable.map(|g| (g.evidence, g.members.clone())).collect()
     }
 

@@ -2,7 +2,8 @@
 //!
 //! The cost of a candidate is the logarithm of its residual, and how unusual its clearance is besides. Right ones are
 //! those in loops (the best of which show how the puzzle's loops close, and what its clearance is), wrong ones the best
-//! others of the same mouths. Before any loop is known, and where there are none, the candidates that stand out serve.
+//! others of the same mouths, and where those are few of all other mouths. Before any loop is known, and where there are none,
+//! the candidates that stand out serve.
 //! The logarithm of how much likelier a cost is for a right candidate than for a wrong one is its evidence; all
 //! decisions of the search are taken on sums of it.
 
@@ -10,6 +11,7 @@ use super::Assembler;
 use crate::loops::{self, Closure, Edge, Tolerance};
 use crate::placement::Joint;
 use crate::slots::{Slot, Slots};
+use std::collections::HashSet;
 
 /// Loops of refined poses close to within this on real pieces (0.8 % and 0.44° measured); calibration tightens it.
 const LOOSE: Tolerance = Tolerance { position: 0.04, angle: 0.05 };
@@ -170,25 +172,63 @@ impl Assembler<'_> {
         joint.fit.residual.max(1e-4).ln() + if self.calibrated { UNUSUAL * (z * z).min(MOST) } else { 0.0 }
     }
 
-    /// Learns what right and wrong candidates cost: right ones are those `trusted`, wrong ones the best others of
-    /// their mouths.
+    /// Learns what right and wrong candidates cost: right ones are those `trusted`, wrong ones the best others of their
+    /// mouths, and as far as those are few the rest of the mouths.
     pub(super) fn learn(&mut self, trusted: &[usize]) {
+        /// So many wrong ones show how they spread.
+        const MANY: usize = 30;
+        self.learn_from(trusted, MANY.saturating_sub(trusted.len()) as f64);
+    }
+
+    /// The same from candidates that stand out. The others of their mouths are far off for that reason alone, so that the
+    /// rest of the mouths counts in full.
+    pub(super) fn learn_from_outstanding(&mut self) {
+        self.learn_from(&self.outstanding(), f64::INFINITY);
+    }
+
+    /// Of the rest of the mouths, which count as so many at most, the best candidate is wrong, or the second best if the
+    /// first is right; which it is, and in how many mouths, follows from what is learnt (expectation and maximisation).
+    fn learn_from(&mut self, trusted: &[usize], most: f64) {
         /// Fewer say too little about the spread.
         const FEW: usize = 4;
+        const STEPS: usize = 12;
         let mut right: Vec<f64> = trusted.iter().map(|k| self.edges[*k].cost).collect();
-        let mut wrong = Vec::new();
-        for &k in trusted {
-            let mouth = self.edges[k].slots[1];
-            let others = self.at[mouth.piece].iter().map(|j| (*j, &self.edges[*j]));
-            let best =
-                others.filter(|(j, e)| *j != k && e.slots[1] == mouth).map(|(_, e)| e.cost).min_by(f64::total_cmp);
-            wrong.extend(best);
-        }
-        if right.len() < FEW || wrong.len() < FEW {
+        let settled: HashSet<Slot> = trusted.iter().map(|k| self.edges[*k].slots[1]).collect();
+        let mut wrong: Vec<(f64, f64)> = trusted.iter().filter_map(|k| Some((self.best_other(*k)?, 1.0))).collect();
+        let rest: Vec<(f64, Option<f64>)> = (0..self.edges.len())
+            .filter(|k| self.edges[*k].mouth_rank == 0 && !settled.contains(&self.edges[*k].slots[1]))
+            .map(|k| (self.edges[k].cost, self.best_other(k)))
+            .collect();
+        if right.len() < FEW || wrong.len() + rest.len() < FEW {
             return;
         }
-        self.model = Model::between(spread_of(&mut right), spread_of(&mut wrong));
+        let right = spread_of(&mut right);
+        let known = wrong.len();
+        let weight = (most / rest.len().max(1) as f64).min(1.0);
+        let mut share = 0.0;
+        for _ in 0..STEPS {
+            wrong.truncate(known);
+            let mut sum = 0.0;
+            for (best, second) in &rest {
+                let odds = share / (1.0 - share) * self.model.evidence(*best).exp();
+                let is_right = odds / (1.0 + odds);
+                sum += is_right;
+                wrong.push((*best, weight * (1.0 - is_right)));
+                wrong.extend(second.map(|second| (second, weight * is_right)));
+            }
+            self.model = Model::between(right, weighted_spread(&mut wrong.clone()));
+            // As if one mouth more had its tab, and one more had not.
+            share = (sum + 1.0) / (rest.len() as f64 + 2.0);
+        }
+        self.present = (share / (1.0 - share)).ln().min(0.0);
         self.learnt = true;
+    }
+
+    /// Cost of the best other candidate in the mouth of one.
+    fn best_other(&self, k: usize) -> Option<f64> {
+        let mouth = self.edges[k].slots[1];
+        let others = self.at[mouth.piece].iter().filter(|j| **j != k && self.edges[**j].slots[1] == mouth);
+        others.map(|j| self.edges[*j].cost).min_by(f64::total_cmp)
     }
 
     /// Before anything is trusted: right candidates cost what noise and sampling make them, wrong ones what the second
@@ -202,7 +242,7 @@ impl Assembler<'_> {
     }
 
     /// Candidates that are the best of their tab and of their mouth by a wide margin: what to learn from without loops.
-    pub(super) fn outstanding(&self) -> Vec<usize> {
+    fn outstanding(&self) -> Vec<usize> {
         const WIDE: f64 = 0.7; // half the residual of any rival
         (0..self.edges.len())
             .filter(|&k| {
@@ -244,4 +284,21 @@ pub(super) fn spread_of(values: &mut [f64]) -> (f64, f64) {
     let middle = median(values).unwrap_or(0.0);
     let mut off: Vec<f64> = values.iter().map(|v| (v - middle).abs()).collect();
     (middle, 1.48 * median(&mut off).unwrap_or(0.0))
+}
+
+/// The same of values with weights.
+fn weighted_spread(values: &mut [(f64, f64)]) -> (f64, f64) {
+    let middle_of = |values: &mut [(f64, f64)]| {
+        values.sort_unstable_by(|p, q| p.0.total_cmp(&q.0));
+        let half = 0.5 * values.iter().map(|v| v.1).sum::<f64>();
+        let mut sum = 0.0;
+        let middle = values.iter().find(|v| {
+            sum += v.1;
+            sum > half
+        });
+        middle.map_or(0.0, |v| v.0)
+    };
+    let middle = middle_of(values);
+    values.iter_mut().for_each(|v| v.0 = (v.0 - middle).abs());
+    (middle, 1.48 * middle_of(values))
 }

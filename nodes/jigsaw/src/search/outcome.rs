@@ -112,7 +112,7 @@ impl Assembler<'_> {
                 continue;
             }
             // What was only looked for because the pieces lie there is no further evidence that they do.
-            let more = if k < candidates { own.max(0.0) + AGREEMENT } else { 0.0 };
+            let more = if k < candidates { (own + self.present).max(0.0) + AGREEMENT } else { 0.0 };
             for s in slots {
                 taken.insert(s, k);
                 evidence[s.piece] += more;
