@@ -166,15 +166,19 @@ enum Layout {
     Bgra,
 }
 
-/// The encodings of `sensor_msgs/Image` that are read, with layout and bytes a pixel.
-const ENCODINGS: [(&str, Layout, u32); 7] = [
+/// The encodings of `sensor_msgs/Image` that are read, with layout and bytes a pixel. Those that name but the type of
+/// the channels come from `cv_bridge`, which passes OpenCV's matrices on: blue first.
+const ENCODINGS: [(&str, Layout, u32); 10] = [
     ("mono8", Layout::Grey, 1),
     ("8UC1", Layout::Grey, 1),
     ("mono16", Layout::Grey16, 2),
+    ("16UC1", Layout::Grey16, 2),
     ("rgb8", Layout::Rgb, 3),
     ("bgr8", Layout::Bgr, 3),
+    ("8UC3", Layout::Bgr, 3),
     ("rgba8", Layout::Rgba, 4),
     ("bgra8", Layout::Bgra, 4),
+    ("8UC4", Layout::Bgra, 4),
 ];
 
 /// A frame as a picture, with its name and header.
@@ -442,21 +446,27 @@ mod tests {
         let swapped = [30, 20, 10, 60, 50, 40, 90, 80, 70, 120, 110, 100];
         let expected = read(image("rgb8", 3, &rgb)).unwrap().to_rgb8();
         assert_eq!(expected.as_raw(), &rgb);
-        assert_eq!(read(image("bgr8", 3, &swapped)).unwrap().to_rgb8(), expected);
+        for encoding in ["bgr8", "8UC3"] {
+            assert_eq!(read(image(encoding, 3, &swapped)).unwrap().to_rgb8(), expected, "{encoding}");
+        }
         let with_alpha = |p: &[u8]| p.chunks(3).flat_map(|c| [c[0], c[1], c[2], 255]).collect::<Vec<_>>();
         assert_eq!(read(image("rgba8", 4, &with_alpha(&rgb))).unwrap().to_rgb8(), expected);
-        assert_eq!(read(image("bgra8", 4, &with_alpha(&swapped))).unwrap().to_rgb8(), expected);
+        for encoding in ["bgra8", "8UC4"] {
+            assert_eq!(read(image(encoding, 4, &with_alpha(&swapped))).unwrap().to_rgb8(), expected, "{encoding}");
+        }
     }
 
     #[test]
     fn sixteen_bits_are_stretched_in_either_byte_order() {
         let levels = [0_u16, 1000, 2000, 4000];
         let little: Vec<u8> = levels.iter().flat_map(|v| v.to_le_bytes()).collect();
-        let mut big = image("mono16", 2, &levels.iter().flat_map(|v| v.to_be_bytes()).collect::<Vec<_>>());
-        big.is_bigendian = 1;
+        let big: Vec<u8> = levels.iter().flat_map(|v| v.to_be_bytes()).collect();
         let expected = [0, 63, 127, 255];
-        assert_eq!(read(image("mono16", 2, &little)).unwrap().to_luma8().as_raw(), &expected);
-        assert_eq!(read(big).unwrap().to_luma8().as_raw(), &expected);
+        for encoding in ["mono16", "16UC1"] {
+            let big = Image { is_bigendian: 1, ..image(encoding, 2, &big) };
+            assert_eq!(read(image(encoding, 2, &little)).unwrap().to_luma8().as_raw(), &expected, "{encoding}");
+            assert_eq!(read(big).unwrap().to_luma8().as_raw(), &expected, "{encoding}");
+        }
     }
 
     #[test]
