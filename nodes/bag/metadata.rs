@@ -24,6 +24,8 @@ pub(super) struct Metadata {
     pub(super) files: Vec<String>,
     /// Each message is compressed by itself.
     pub(super) messages_compressed: bool,
+    /// What files or messages are compressed with, where that is not zstd.
+    pub(super) foreign_compression: Option<String>,
 }
 
 #[derive(Debug, Serialize, Deserialize)]
@@ -117,6 +119,10 @@ impl Metadata {
         let document: Document = serde_yaml_ng::from_str(&text).map_err(|e| e.to_string())?;
         let information = document.rosbag2_bagfile_information;
         let mode = information.compression_mode.unwrap_or_default().to_ascii_lowercase();
+        let compressed = ["file", "message"].contains(&mode.as_str());
+        let foreign_compression = information
+            .compression_format
+            .filter(|format| compressed && !format.is_empty() && !format.eq_ignore_ascii_case("zstd"));
         // Old versions put the bag's own folder in front of the name; nothing may lead out of the folder.
         let files = information
             .relative_file_paths
@@ -124,7 +130,7 @@ impl Metadata {
             .filter_map(|path| Path::new(path).file_name())
             .map(|name| name.to_string_lossy().into_owned())
             .collect();
-        Ok(Self { files, messages_compressed: mode == "message" })
+        Ok(Self { files, messages_compressed: mode == "message", foreign_compression })
     }
 }
 

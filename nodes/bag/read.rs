@@ -20,7 +20,8 @@ use super::metadata::{self, Metadata};
 use super::storage::{FileContents, MAX_RECORD_BYTES, MessageIter, Selection};
 use super::{BagError, BagWarning, RawMessage, Storage, TopicCount, mcap, sqlite};
 
-/// The first bytes of a zstd frame: a whole storage file compressed by the recorder.
+/// The first bytes of a zstd frame: a whole storage file or a message compressed by the recorder. No message begins so
+/// by itself, since the representations of CDR have small numbers.
 const ZSTD_MAGIC: &[u8] = &[0x28, 0xb5, 0x2f, 0xfd];
 
 enum Opened {
@@ -60,6 +61,10 @@ impl BagReader {
             let mut names = Vec::new();
             match Metadata::read(&metadata_path) {
                 Ok(metadata) => {
+                    if let Some(format) = metadata.foreign_compression {
+                        let feature = format!("compression '{format}' in place of zstd");
+                        return Err(BagError::Unsupported { path: metadata_path, feature });
+                    }
                     messages_compressed = metadata.messages_compressed;
                     names = metadata.files;
                 }
@@ -307,7 +312,9 @@ impl Iterator for Messages<'_> {
                 State::Waiting => self.cursors[index].state = self.open(self.cursors[index].file),
                 State::Reading { next, rest } => {
                     self.cursors[index].state = advance(rest);
-                    return Some(if self.decompress { decompress_message(next) } else { Ok(next) });
+                    // A recorder that was killed has left no metadata to say what it did.
+                    let compressed = self.decompress || next.cdr.starts_with(ZSTD_MAGIC);
+                    return Some(if compressed { decompress_message(next) } else { Ok(next) });
                 }
                 State::Failed(error) => return Some(Err(error)),
                 State::Ended => return None,

@@ -186,6 +186,31 @@ fn compressed_files_and_messages() {
     assert_eq!(messages.next().unwrap().unwrap().cdr, content(9));
     assert!(matches!(messages.next(), Some(Err(BagError::Damaged { .. }))));
     assert!(messages.next().is_none());
+
+    // Without the metadata, which a recorder that was killed has not written, only the content tells.
+    let bag = BagReader::open(&storage_file(&path)).unwrap();
+    let cdrs: Vec<_> = contents(&bag, Selection::all()).into_iter().map(|(.., cdr)| cdr).collect();
+    assert_eq!(cdrs, [content(9), b"not zstd".to_vec()]);
+}
+
+#[test]
+fn another_compression_than_zstd_is_refused_by_its_name() {
+    for mode in ["file", "MESSAGE"] {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("bag");
+        write_bag(&path, WriterOptions::default());
+        let metadata = std::fs::read_to_string(path.join("metadata.yaml")).unwrap();
+        let claim = |format: &str| {
+            let claimed = metadata
+                .replace("compression_mode: ''", &format!("compression_mode: {mode}"))
+                .replace("compression_format: ''", &format!("compression_format: {format}"));
+            std::fs::write(path.join("metadata.yaml"), claimed).unwrap();
+            BagReader::open(&path).map(|_| ()).map_err(|error| error.to_string())
+        };
+        let message = claim("lz4").unwrap_err();
+        assert!(message.ends_with("metadata.yaml: compression 'lz4' in place of zstd is not supported"), "{message}");
+        assert_eq!(claim("ZSTD"), Ok(()));
+    }
 }
 
 #[test]
