@@ -124,11 +124,12 @@ impl Assembler<'_> {
         };
         let island = self.state.island(held);
         let beside = self.beside(piece, island, away, &pose);
-        let share = self.share_at_first_sight(piece, &beside, &pose);
+        let seen = self.seen_from(&beside, &pose);
+        let share = self.share_at_first_sight(piece, &seen);
         if share < LEAST_SHARE {
             return None;
         }
-        let overlap = self.greatest_overlap(piece, &self.seen_from(&beside, &pose));
+        let overlap = self.greatest_overlap(piece, &seen);
         Some(Place { piece, edge, island, pose, beside, share, overlap })
     }
 
@@ -171,12 +172,11 @@ impl Assembler<'_> {
         self.state.members(island).filter(|q| *q != piece).filter(near).filter(there).collect()
     }
 
-    /// Part of the border of a piece in a pose that has another near.
-    fn share_at_first_sight(&self, piece: usize, beside: &[usize], pose: &Isometry2<f64>) -> f64 {
+    /// Part of the border of a piece that has another near, of those from which it is seen in some poses.
+    fn share_at_first_sight(&self, piece: usize, seen: &[(usize, Isometry2<f64>)]) -> f64 {
         let outline = self.outlines[piece];
         let stride = ((outline.scale / SIGHT_STEPS / outline.spacing) as usize).max(1);
         let near = NEAR * self.scale;
-        let seen = self.seen_from(beside, pose);
         let has_near = |p: &&Point| {
             seen.iter().any(|(q, q_from_piece)| {
                 let raster = &self.outlines[*q].raster;

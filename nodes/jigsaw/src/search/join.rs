@@ -152,7 +152,7 @@ impl Assembler<'_> {
             self.state.pose[k] = motion * self.state.pose[k];
         }
         self.state.unite(from, to);
-        // Drift grows with the way through the island; adjusting at every doubling keeps it small at little cost.
+        // Drift grows with the way through the island; adjusting when it is half as large again keeps it small at little cost.
         let size = self.state.size(to);
         if self.params.pose_graph
             && self.params.policy == Policy::Standard

@@ -81,7 +81,10 @@ impl Assembler<'_> {
             self.edges.push(Edge { cost: self.cost(&joint), ..edge(&joint, self.outlines, &self.slots) });
             self.joints.push(joint);
         }
-        rank(&mut self.edges, &self.slots);
-        self.edges.len() > before
+        let any = self.edges.len() > before;
+        if any {
+            rank(&mut self.edges, &self.slots);
+        }
+        any
     }
 }
