@@ -6,7 +6,8 @@
 //!    diagonal cell joins the shape where its mean lies on the shape's side (G. M. Nielson, B. Hamann, *The asymptotic
 //!    decider*, Visualization 1991). Of all closed contours the longest outer one is taken.
 //! 2. A picture that is too noisy or too sharp (one-bit, without grey levels at the edge) for its contour to be trusted is
-//!    blurred first, near the contour: just enough, as the measured noise and edge blur ask for.
+//!    blurred first, near the contour: just enough, as the measured noise and edge blur ask for. What the pixel grid has done to
+//!    sharp edges along it by then is known, and taken off (`iso`).
 //! 3. *Resampling* at equal steps of about one pixel of arc length.
 //! 4. *Restoration*: blur rounds a border, its curves move towards their centres. One linear filter along the border undoes the
 //!    measured blur as far as the measured noise allows (`restore`).
@@ -36,7 +37,7 @@ mod restore;
 use crate::Point;
 use crate::cutout::Cutout;
 use band::{Band, Blurred, Raw};
-use iso::{Contours, Raster, Start};
+use iso::{Contours, Raster, Start, aliasing};
 use nalgebra::Vector2;
 use restore::{Filter, History, edge_blur, noise_power};
 
@@ -282,6 +283,24 @@ impl Border {
 
     /// Fills the border with equally spaced points of a closed polygon, about `self.spacing` apart.
     fn resample(&mut self, polygon: &[Point]) -> Result<(), ContourError> {
+        self.resample_by(polygon, |i, t| polygon[i] + (polygon[(i + 1) % polygon.len()] - polygon[i]) * t)
+    }
+
+    /// Fills the border with equally spaced points, about `self.spacing` apart, of a curve through (almost) equally spaced
+    /// points: between two of them lies the cubic of E. Catmull and R. Rom, 1974.
+    fn resample_curve(&mut self, points: &[Point]) -> Result<(), ContourError> {
+        let n = points.len();
+        self.resample_by(points, |i, t| {
+            let [a, b, c, d] = [i + n - 1, i, i + 1, i + 2].map(|k| points[k % n].coords);
+            let (slope, next_slope) = ((c - a) * 0.5, (d - b) * 0.5);
+            let (u, chord) = (1.0 - t, c - b);
+            Point::from(b + chord * t + ((slope - chord) * u - (next_slope - chord) * t) * (t * u))
+        })
+    }
+
+    /// Fills the border with equally spaced points, about `self.spacing` apart; `at` gives the point between two corners of a
+    /// polygon, from the first one's index and how far between them.
+    fn resample_by(&mut self, polygon: &[Point], at: impl Fn(usize, f64) -> Point) -> Result<(), ContourError> {
         let length: f64 = edges(polygon).map(|(p, q)| (q - p).norm()).sum();
         let spacing = self.spacing;
         let count = (length / spacing).round();
@@ -296,13 +315,12 @@ impl Border {
         self.points.clear();
         self.points.reserve(count);
         let mut start = 0.0;
-        for (p, q) in edges(polygon) {
-            let d = q - p;
-            let end = start + d.norm();
+        for (i, (p, q)) in edges(polygon).enumerate() {
+            let end = start + (q - p).norm();
             // The next sample's position is computed, not summed, so that long borders do not drift.
             let mut next = self.points.len() as f64 * self.spacing;
             while next < end && self.points.len() < count {
-                self.points.push(p + d * ((next - start) / (end - start)));
+                self.points.push(at(i, (next - start) / (end - start)));
                 next = self.points.len() as f64 * self.spacing;
             }
             start = end;
@@ -410,7 +428,7 @@ impl Tracer {
 
         let first = half.unwrap_or(full);
         first.starts(level, sense, &mut self.starts);
-        if !self.contours.trace(&Raster { picture: first, level, contrast, sense }, &self.starts) {
+        if !self.contours.trace(&Raster { picture: first, level, contrast, sense, aliasing: 0.0 }, &self.starts) {
             return None;
         }
         let edge_blur_in = |raw: Raw<'_>, contour: &[Point]| {
@@ -427,7 +445,8 @@ impl Tracer {
             let is_shape = |value: f32| sense * (value - level) > 0.0;
             self.band.blur(second, sigma, cutout.ground_level, is_shape, &mut self.starts);
             let picture = Blurred { band: &self.band, raw: second };
-            if !self.contours.trace(&Raster { picture, level, contrast, sense }, &self.starts) {
+            let aliasing = aliasing(optical / second.step, sigma);
+            if !self.contours.trace(&Raster { picture, level, contrast, sense, aliasing }, &self.starts) {
                 return None;
             }
             for p in &mut self.contours.longest {
@@ -454,7 +473,7 @@ impl Tracer {
         let left = self.filter.design(History { blur, late_blur, radius }, noise);
         self.filter.apply(&border.points, &mut self.filtered);
         border.spacing = SPACING;
-        border.resample(&self.filtered)?;
+        border.resample_curve(&self.filtered)?;
         Ok(left.sqrt() * border.spacing)
     }
 

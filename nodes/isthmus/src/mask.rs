@@ -35,23 +35,28 @@
 //! # Ok::<(), isthmus::mask::MaskError>(())
 //! ```
 
+mod blocks;
 mod clipping;
 mod crop;
 mod frame;
 mod ground;
 mod levels;
+mod metric;
 mod runs;
 mod segmentation;
 mod sift;
 mod standing;
+mod statistics;
+mod surface;
 mod threads;
 
 pub use crate::cutout::{Aoi, Cutout};
 pub use frame::{Frame, MAX_SIDE, MaskError, PixelFormat};
 pub use segmentation::{MIN_REPORTED_AREA, Parameters, Reason, Rejected, Segmentation};
 
+use blocks::Blocks;
 use crop::Crop;
-use ground::{Blocks, Ground};
+use ground::Ground;
 use runs::Components;
 use sift::{Found, sift};
 use standing::Standing;

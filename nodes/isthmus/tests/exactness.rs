@@ -136,6 +136,32 @@ fn pictures() {
     }
 }
 
+/// The pixel grid leaves no waves on edges that run nearly along it, in pictures sharper than the grid.
+#[test]
+fn edges_along_the_grid() {
+    /// Root mean square of the points' distances from the edge, in pixels: five times that of quantised grey levels.
+    const WAVES: f64 = 0.004;
+    /// Half the side of a square, and how much of it next to a corner is left out.
+    const HALF: f64 = 90.0;
+    const CORNER: f64 = 30.0;
+    for degrees in [1.0, 2.0, 3.0, 5.0, 8.0, 12.0] {
+        let image_from_square = pose(f64::to_radians(degrees), 1.0, 256.3, 255.6);
+        let corners = [[-HALF, -HALF], [HALF, -HALF], [HALF, HALF], [-HALF, HALF]];
+        let outline = corners.map(|[x, y]| image_from_square * isthmus::Point::new(x, y));
+        let camera = Camera { blur: 0.0, ..Camera::default() };
+        let (border, _) = Border::from_cutout(&camera.cutout(&outline)).unwrap();
+        let squares: Vec<f64> = border
+            .points
+            .iter()
+            .map(|p| image_from_square.inverse() * p)
+            .filter(|p| p.y.abs() < HALF - CORNER)
+            .map(|p| (p.x.abs() - HALF).powi(2))
+            .collect();
+        let waves = (squares.iter().sum::<f64>() / squares.len() as f64).sqrt();
+        assert!(squares.len() > 200 && waves < WAVES, "{degrees}°: {waves} px at {} points", squares.len());
+    }
+}
+
 /// Blur moves a neck towards the tighter side of a jump of curvature, and noise decides how much of that can be undone: limits as above, on
 /// banks whose radius changes at the neck.
 #[test]

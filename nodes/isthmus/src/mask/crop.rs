@@ -1,11 +1,11 @@
 //! A component with its surroundings, cut out of the frame pixel by pixel, in a form in which half-way between two fixed levels is the border.
 
 use super::frame::{Frame, PixelFormat};
-use super::ground::{median, quantile};
 use super::levels::{Levels, RowSource};
 use super::runs::{Component, Components};
 use super::segmentation::Parameters;
 use super::standing::{NOBODY, Standing};
+use super::statistics::{median, quantile};
 use super::threads::Threads;
 use crate::Point;
 use crate::cutout::{Aoi, Cutout};

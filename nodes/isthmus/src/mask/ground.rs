@@ -7,214 +7,13 @@
 //! brightness, hardly in hue. Where the light varies by more than shapes and ground differ, no threshold tells the two apart; then the ground is
 //! sought along the frame's rim.
 
+use super::blocks::{Blocks, Sample};
 use super::clipping::Clipping;
 use super::frame::Frame;
-use nalgebra::{Matrix3, Matrix6, Vector3, Vector6};
-
-/// Means over square blocks of pixels.
-#[derive(Debug, Clone, Default)]
-pub(super) struct Blocks {
-    /// Pixels along the side of a block.
-    pub(super) size: usize,
-    pub(super) columns: usize,
-    pub(super) rows: usize,
-    /// One plane for a grey frame, three for a colour one.
-    pub(super) planes: Vec<Vec<f32>>,
-    /// The blocks that are looked at to find the ground, all over the frame.
-    samples: Vec<Sample>,
-    sums: Vec<u16>,
-}
-
-impl Blocks {
-    /// Chooses the blocks that are looked at to find the ground.
-    fn choose_samples(&mut self) {
-        let (columns, rows) = (self.columns, self.rows);
-        let step = ((columns * rows) as f64 / SAMPLES as f64).sqrt().round().max(1.0) as usize;
-        // Frames of a few rows are looked at all along.
-        let (across, down) = if rows < step {
-            (step, 1)
-        } else if columns < step {
-            (1, step)
-        } else {
-            (step, step)
-        };
-        self.samples.clear();
-        for row in (0..rows).step_by(down) {
-            // Each row begins elsewhere, so that narrow upright shapes are hit as well.
-            let from = if columns > across { row / down % across } else { 0 };
-            for column in (from..columns).step_by(across) {
-                self.samples.push(Sample { block: row * columns + column, column: column as u32, row: row as u32 });
-            }
-        }
-    }
-
-    pub(super) fn fill(&mut self, frame: &Frame<'_>) {
-        let channels = frame.format.channels();
-        let (width, height) = (frame.width, frame.height);
-        self.size = block_size(width.min(height));
-        self.columns = width.div_ceil(self.size);
-        self.rows = height.div_ceil(self.size);
-        self.choose_samples();
-        self.planes.resize_with(channels, Vec::new);
-        for plane in &mut self.planes {
-            plane.clear();
-            plane.reserve(self.columns * self.rows);
-        }
-        for block_row in 0..self.rows {
-            let rows = block_row * self.size..height.min((block_row + 1) * self.size);
-            // The usual blocks are summed eight pixels at a time; what is left of the row goes the common way.
-            let done = match (&mut self.planes[..], self.size, rows.len()) {
-                ([plane], 4, 4) => sum_blocks([0, 1, 2, 3].map(|k| frame.row(rows.start + k)), plane),
-                _ => 0,
-            };
-            if done == width {
-                continue;
-            }
-            let count = rows.len();
-            self.sums.clear();
-            self.sums.resize((width - done) * channels, 0);
-            for y in rows {
-                for (sum, p) in self.sums.iter_mut().zip(&frame.row(y)[done * channels..]) {
-                    *sum += u16::from(*p);
-                }
-            }
-            for (c, plane) in self.planes.iter_mut().enumerate() {
-                plane.extend(self.sums.chunks(self.size * channels).map(|block| {
-                    let sum: u32 = block.iter().skip(c).step_by(channels).map(|s| u32::from(*s)).sum();
-                    sum as f32 / (block.len() / channels * count) as f32
-                }));
-            }
-        }
-    }
-}
-
-/// Appends the means of the blocks of 4 x 4 pixels of four rows, of two blocks at a time; gives the number of columns done.
-fn sum_blocks(rows: [&[u8]; 4], means: &mut Vec<f32>) -> usize {
-    /// Every other byte, and every other pair of bytes, of a word.
-    const BYTES: u64 = 0x00ff_00ff_00ff_00ff;
-    const PAIRS: u64 = 0x0000_ffff_0000_ffff;
-    let [a, b, c, d] = rows.map(|row| row.as_chunks::<8>().0);
-    let from = means.len();
-    means.resize(from + 2 * a.len(), 0.0);
-    let words = a.iter().zip(b).zip(c).zip(d).map(|(((a, b), c), d)| [a, b, c, d].map(|p| u64::from_le_bytes(*p)));
-    for (means, words) in means[from..].as_chunks_mut::<2>().0.iter_mut().zip(words) {
-        // Sums side by side in one word: of the pixels of a pair, then of two pairs. No sum outgrows its sixteen bits.
-        let pairs = words.iter().fold(0, |sum, w| sum + (w & BYTES) + (w >> 8 & BYTES));
-        let blocks = (pairs & PAIRS) + (pairs >> 16 & PAIRS);
-        *means = [blocks as u32 as i32, (blocks >> 32) as i32].map(|sum| sum as f32 / 16.0);
-    }
-    a.len() * 8
-}
-
-/// Side of a block in pixels: small pictures have small shapes.
-fn block_size(frame_side: usize) -> usize {
-    match frame_side {
-        0..128 => 1,
-        128..700 => 2,
-        _ => 4,
-    }
-}
-
-/// A quadratic surface over a frame or a part of it, in block coordinates scaled to -1..1.
-#[derive(Debug, Clone, Copy)]
-pub(super) struct Surface {
-    coefficients: Vector6<f64>,
-    scale: [f64; 2],
-}
-
-impl Surface {
-    /// Least squares fit to the levels of blocks (column, row, level) of a picture of so many columns and rows, repeated without what lies
-    /// far from the first fit (specks, shadows): beyond three deviations.
-    pub(super) fn fit(size: [usize; 2], levels: impl Iterator<Item = ([f64; 2], f32)>) -> Self {
-        let scale = size.map(|n| 2.0 / (n.max(2) - 1) as f64);
-        let samples: Vec<([f64; 2], f32)> = levels.collect();
-        let mut sums = NormalEquations::default();
-        for (place, level) in &samples {
-            sums.add(scaled(scale, *place), f64::from(*level), 1.0);
-        }
-        let first = Self { coefficients: sums.solve(), scale };
-        let residuals: Vec<f32> = samples.iter().map(|([x, y], level)| (level - first.at(*x, *y)).abs()).collect();
-        let limit = (3.0 / NORMAL_MAD * median(residuals.clone())).max(1.0);
-        for ((place, level), _) in samples.iter().zip(&residuals).filter(|(_, residual)| **residual > limit) {
-            sums.add(scaled(scale, *place), f64::from(*level), -1.0);
-        }
-        Self { coefficients: sums.solve(), scale }
-    }
-
-    /// Level at a block.
-    pub(super) fn at(&self, column: f64, row: f64) -> f32 {
-        let c = &self.coefficients;
-        let [u, v] = scaled(self.scale, [column, row]);
-        (c[0] + v * (c[2] + v * c[5]) + u * (c[1] + v * c[4] + u * c[3])) as f32
-    }
-
-    /// The levels along a row, from a column in steps.
-    pub(super) fn along(&self, row: f64, column: f64, step: f64) -> AlongRow {
-        let c = self.coefficients;
-        let [u, v] = scaled(self.scale, [column, row]);
-        let step = step * self.scale[0];
-        let slope = c[1] + v * c[4];
-        let level = c[0] + v * (c[2] + v * c[5]) + u * (slope + u * c[3]);
-        AlongRow([level, (slope + 2.0 * u * c[3]) * step, c[3] * step * step].map(|k| k as f32))
-    }
-}
-
-/// Levels along a row: a quadratic polynomial of the number of the step.
-#[derive(Debug, Clone, Copy)]
-pub(super) struct AlongRow([f32; 3]);
-
-impl AlongRow {
-    /// Level after so many steps.
-    pub(super) fn at(&self, steps: usize) -> f32 {
-        // A row is no longer than a number of four bytes, which the processor turns into a float several at a time.
-        let i = steps as i32 as f32;
-        self.0[0] + i * (self.0[1] + i * self.0[2])
-    }
-}
-
-/// A place in the coordinates of a surface.
-fn scaled(scale: [f64; 2], [column, row]: [f64; 2]) -> [f64; 2] {
-    [column * scale[0] - 1.0, row * scale[1] - 1.0]
-}
-
-/// Sums over samples that a least squares fit of a quadratic surface needs.
-#[derive(Debug, Default)]
-struct NormalEquations {
-    count: f64,
-    /// Sums of `u^a v^b` up to the fourth degree, degree by degree, rising in `b`.
-    moments: [f64; 15],
-    /// Sums of the level times those up to the second degree.
-    right: [f64; 6],
-}
-
-impl NormalEquations {
-    /// Adds a sample (of weight 1), or takes it away again (-1).
-    fn add(&mut self, [u, v]: [f64; 2], level: f64, weight: f64) {
-        let (uu, uv, vv) = (u * u, u * v, v * v);
-        let powers =
-            [1.0, u, v, uu, uv, vv, uu * u, uu * v, u * vv, v * vv, uu * uu, uu * uv, uu * vv, uv * vv, vv * vv];
-        self.count += weight;
-        for (sum, power) in self.moments.iter_mut().zip(powers) {
-            *sum += weight * power;
-        }
-        for (sum, power) in self.right.iter_mut().zip(powers) {
-            *sum += weight * level * power;
-        }
-    }
-
-    /// Coefficients of 1, u, v, u^2, uv, v^2.
-    fn solve(&self) -> Vector6<f64> {
-        const EXPONENTS: [[usize; 2]; 6] = [[0, 0], [1, 0], [0, 1], [2, 0], [1, 1], [0, 2]];
-        let normal = Matrix6::from_fn(|i, j| {
-            let [a, b] = [0, 1].map(|k| EXPONENTS[i][k] + EXPONENTS[j][k]);
-            let degree = a + b;
-            self.moments[degree * (degree + 1) / 2 + b]
-        });
-        // A tiny ridge: the ground of a tight crop may not determine all coefficients.
-        let normal = normal + Matrix6::identity() * (1e-6 * self.count.max(1.0));
-        normal.cholesky().map_or_else(Vector6::zeros, |factor| factor.solve(&Vector6::from(self.right)))
-    }
-}
+use super::metric::Metric;
+use super::statistics::{NORMAL_MAD, median, otsu};
+use super::surface::{AlongRow, Surface};
+use nalgebra::Vector3;
 
 /// The ground and what stands out from it.
 #[derive(Debug, Clone, Default)]
@@ -243,6 +42,16 @@ impl Ground {
         self.difference([column as f64, row as f64], |c| clipping.level(blocks.planes[c][block]))
     }
 
+    /// The ground along a row, from a column in steps.
+    pub(super) fn along(&self, row: f64, column: f64, step: f64) -> GroundRow<'_> {
+        let mut levels = [AlongRow::default(); MAX_CHANNELS];
+        let channels = self.surfaces.len().min(MAX_CHANNELS);
+        for (levels, surface) in levels.iter_mut().zip(&self.surfaces) {
+            *levels = surface.along(row, column, step);
+        }
+        GroundRow { levels, channels, metric: self.metric.as_ref() }
+    }
+
     /// By how much the levels of a block differ from the ground: in the metric, by the largest of the channels.
     fn difference(&self, [column, row]: [f64; 2], level: impl Fn(usize) -> f32) -> f32 {
         let differences = self.surfaces.iter().enumerate().map(|(c, surface)| level(c) - surface.at(column, row));
@@ -257,42 +66,44 @@ impl Ground {
     }
 }
 
-/// Differences in colour, shortened where the ground itself scatters.
-#[derive(Debug, Clone)]
-pub(super) struct Metric([[f32; 3]; 3]);
+/// Channels of a colour frame.
+const MAX_CHANNELS: usize = 3;
 
-impl Metric {
-    /// Metric of the ground's differences from its surface; none for scatter that is little or the same in all directions.
-    fn of(differences: &[Vector3<f32>]) -> Option<Self> {
-        let mut sums = Matrix3::zeros();
-        for d in differences {
-            sums += d * d.transpose();
-        }
-        let eigen = sums.cast::<f64>().symmetric_eigen();
-        let axes = eigen.eigenvectors.cast::<f32>();
-        // What is no ground makes far outliers: medians rather than the sums themselves.
-        let along = |axis: usize| median(differences.iter().map(|d| axes.column(axis).dot(d).abs()).collect());
-        let scatter = [0, 1, 2].map(|axis| (along(axis) / NORMAL_MAD).max(MIN_SCATTER));
-        let [least, most] = [f32::min, f32::max].map(|pick| scatter.into_iter().reduce(pick).unwrap_or(MIN_SCATTER));
-        if most.is_nan() || most <= EVEN_SCATTER * least {
-            return None;
-        }
-        let weights = Matrix3::from_diagonal(&Vector3::from(scatter.map(|s| least / s)));
-        let metric = axes * weights * axes.transpose();
-        Some(Self([0, 1, 2].map(|row| [0, 1, 2].map(|column| metric[(row, column)]))))
-    }
-
-    /// Length of a difference: the largest of the channels, as everywhere.
-    pub(super) fn length(&self, [r, g, b]: [f32; 3]) -> f32 {
-        let channel = |w: &[f32; 3]| (w[0] * r + w[1] * g + w[2] * b).abs();
-        self.0.iter().map(channel).fold(0.0, |most, d| if d > most { d } else { most })
-    }
+/// The ground along a row of pixels or blocks.
+pub(super) struct GroundRow<'a> {
+    levels: [AlongRow; MAX_CHANNELS],
+    channels: usize,
+    metric: Option<&'a Metric>,
 }
 
-/// Least scatter of the ground's blocks along an axis of colour, in grey levels: less is not told from rounding and compression.
-const MIN_SCATTER: f32 = 2.0;
-/// Scatter that differs by less than this factor between directions is taken for even: its measure is that of medians.
-const EVEN_SCATTER: f32 = 1.5;
+impl GroundRow<'_> {
+    /// The levels of a grey frame's ground.
+    pub(super) fn grey(&self) -> Option<AlongRow> {
+        (self.channels == 1).then_some(self.levels[0])
+    }
+
+    /// Fills a row with its differences from the ground; `values` gives the row's levels in a channel.
+    pub(super) fn fill_differences<I: Iterator<Item = f32>>(
+        &self,
+        values: impl Fn(usize) -> I,
+        differences: &mut [f32],
+    ) {
+        if let Some(metric) = self.metric {
+            let [r, g, b] = self.levels;
+            let colours = values(0).zip(values(1)).zip(values(2));
+            for (i, (difference, ((red, green), blue))) in differences.iter_mut().zip(colours).enumerate() {
+                *difference = metric.length([red - r.at(i), green - g.at(i), blue - b.at(i)]);
+            }
+            return;
+        }
+        for (channel, levels) in self.levels[..self.channels].iter().enumerate() {
+            for (i, (difference, value)) in differences.iter_mut().zip(values(channel)).enumerate() {
+                let own = (value - levels.at(i)).abs();
+                *difference = if channel == 0 { own } else { difference.max(own) };
+            }
+        }
+    }
+}
 
 /// A block that differs from the ground by more than this many standard deviations of the ground's blocks is shape.
 const OUTLIER: f32 = 6.0;
@@ -306,14 +117,10 @@ const MIN_RELATIVE_RESIDUAL: f32 = 0.12;
 const CLASS_CLARITY: f32 = 4.0;
 /// Shapes that stand out by fewer deviations may do so from a wrong ground, one side of uneven light taken for shape.
 const CLEAR: f32 = 2.0 * CLASS_CLARITY;
-/// Blocks that are looked at to find the ground: a shape of a thousandth of the frame still has several among them.
-const SAMPLES: usize = 5_000;
 /// Blocks used for the fit: more do not make a quadratic any better.
 const FIT_SAMPLES: usize = 800;
 /// One in so many of the ground's blocks tells its scatter: a median of a thousand is known to a thirtieth.
 const SCATTER_STEP: usize = 4;
-/// Median absolute deviation of a normal distribution of standard deviation 1.
-const NORMAL_MAD: f32 = 0.674_5;
 /// Median of the largest of three such deviations: of those in three channels.
 const LARGEST_OF_THREE: f32 = 1.260_8;
 /// Rounds of fitting the ground and asking again what belongs to it.
@@ -329,15 +136,6 @@ const SURE_SHARE: f64 = 0.62;
 pub(super) struct Candidate {
     /// Whether each block of [`Blocks::samples`] is ground.
     is_ground: Vec<bool>,
-}
-
-/// A block that is looked at.
-#[derive(Debug, Clone, Copy)]
-struct Sample {
-    block: usize,
-    // Of four bytes, so that they become floating point numbers in one step.
-    column: u32,
-    row: u32,
 }
 
 /// What tells ground and shapes apart.
@@ -486,26 +284,12 @@ fn metric(blocks: &Blocks, surfaces: &[Surface], is_ground: &[bool]) -> Option<M
 
 /// Finds by how much each block differs from the ground.
 fn fill_residuals(blocks: &Blocks, ground: &mut Ground) {
-    if let (Some(metric), [r, g, b], [red, green, blue]) = (&ground.metric, &blocks.planes[..], &ground.surfaces[..]) {
-        for (row, residuals) in ground.residual.chunks_exact_mut(blocks.columns).enumerate() {
-            let channels = [(r, red), (g, green), (b, blue)]
-                .map(|(plane, surface)| (&plane[row * blocks.columns..], surface.along(row as f64, 0.0, 1.0)));
-            for (column, residual) in residuals.iter_mut().enumerate() {
-                *residual = metric.length(channels.map(|(values, levels)| values[column] - levels.at(column)));
-            }
-        }
-        return;
+    let mut residual = std::mem::take(&mut ground.residual);
+    for (row, residuals) in residual.chunks_exact_mut(blocks.columns).enumerate() {
+        let values = |c: usize| blocks.planes[c][row * blocks.columns..][..blocks.columns].iter().copied();
+        ground.along(row as f64, 0.0, 1.0).fill_differences(values, residuals);
     }
-    for (channel, (plane, surface)) in blocks.planes.iter().zip(&ground.surfaces).enumerate() {
-        let rows = plane.chunks_exact(blocks.columns).zip(ground.residual.chunks_exact_mut(blocks.columns));
-        for (row, (values, residuals)) in rows.enumerate() {
-            let levels = surface.along(row as f64, 0.0, 1.0);
-            for (column, (residual, value)) in residuals.iter_mut().zip(values).enumerate() {
-                let difference = (value - levels.at(column)).abs();
-                *residual = if channel == 0 { difference } else { residual.max(difference) };
-            }
-        }
-    }
+    ground.residual = residual;
 }
 
 /// What noise does to the levels of a frame, if it reaches beyond black or white anywhere.
@@ -539,59 +323,4 @@ fn fit_surface(blocks: &Blocks, plane: &[f32], is_ground: &[bool], clipping: Opt
     let level = |level| clipping.map_or(level, |clipping| clipping.level(level));
     let samples = chosen.map(|(s, _)| ([f64::from(s.column), f64::from(s.row)], level(plane[s.block])));
     Surface::fit([blocks.columns, blocks.rows], samples)
-}
-
-/// Two classes of values.
-pub(super) struct Split {
-    pub(super) threshold: f32,
-    /// Between-class part of the variance, 0 to 1.
-    separation: f64,
-    /// Mean of the upper class.
-    mean_above: f32,
-}
-
-/// The threshold that leaves the least variance within two classes (N. Otsu, *A threshold selection method from gray-level
-/// histograms*, IEEE Trans. SMC 9, 1979).
-pub(super) fn otsu(values: &[f32]) -> Split {
-    let mut histogram = [0u32; 256];
-    for v in values {
-        histogram[*v as u8 as usize] += 1;
-    }
-    let total = values.len() as f64;
-    let sum: f64 = histogram.iter().enumerate().map(|(v, n)| v as f64 * f64::from(*n)).sum();
-    let squares: f64 = histogram.iter().enumerate().map(|(v, n)| (v * v) as f64 * f64::from(*n)).sum();
-    let variance = squares / total - (sum / total).powi(2);
-    let mut best = Split { threshold: 255.0, separation: 0.0, mean_above: 255.0 };
-    let (mut below, mut below_sum, mut gain) = (0.0, 0.0, 0.0);
-    for (v, n) in histogram.iter().enumerate() {
-        below += f64::from(*n);
-        below_sum += v as f64 * f64::from(*n);
-        if below == 0.0 || below == total {
-            continue;
-        }
-        let (low, high) = (below_sum / below, (sum - below_sum) / (total - below));
-        let between = below * (total - below) * (high - low).powi(2);
-        if between > gain {
-            gain = between;
-            // Half-way between the class means, rather than at the first of many equally good thresholds.
-            let threshold = ((low + high) / 2.0) as f32;
-            let separation = if variance > 0.0 { between / (total * total) / variance } else { 0.0 };
-            best = Split { threshold, separation, mean_above: high as f32 };
-        }
-    }
-    best
-}
-
-/// Median of a list; 0 of an empty one.
-pub(super) fn median(mut values: Vec<f32>) -> f32 {
-    quantile(&mut values, 0.5)
-}
-
-/// Quantile of a list (which gets reordered); 0 of an empty one.
-pub(super) fn quantile(values: &mut [f32], q: f64) -> f32 {
-    if values.is_empty() {
-        return 0.0;
-    }
-    let k = ((values.len() - 1) as f64 * q) as usize;
-    *values.select_nth_unstable_by(k, f32::total_cmp).1
 }

@@ -1,9 +1,11 @@
 //! Levels of a component and of the ground round it.
 
 use super::frame::Frame;
-use super::ground::{Ground, Surface, median, quantile};
+use super::ground::Ground;
 use super::runs::Component;
 use super::standing::{MAX_DEPTH, Standing};
+use super::statistics::{median, quantile};
+use super::surface::Surface;
 
 /// Most spread of the shape's level (between its quartiles, noise aside), as a part of the contrast, at which the pixels are cut out
 /// as they are: the contour half-way moves by a thirtieth of the edge's blur at most.
@@ -363,9 +365,11 @@ impl Levels {
         let source = &frame.row(y)[from * channels..];
         let (row, column, step) = (in_blocks(y, block), in_blocks(from, block), 1.0 / block as f64);
         let range = shape_level - ground_level;
-        if let (true, Course::Smooth(light), [ground]) = (self.one_sided, &self.course, &rows.ground.surfaces[..]) {
+        let ground = rows.ground.along(row, column, step);
+        let signed = ground.grey().filter(|_| self.one_sided);
+        if let (Some(ground), Course::Smooth(light)) = (signed, &self.course) {
             // Neighbouring pixels go through the processor together, all the way.
-            let (ground, light) = (ground.along(row, column, step), self.light_along(light, block, (y, from)));
+            let light = self.light_along(light, block, (y, from));
             let range = self.sense * range;
             for (i, (out, p)) in out.iter_mut().zip(source).enumerate() {
                 *out = rounded(ground_level + range * (f32::from(*p) - ground.at(i)) / light(i));
@@ -377,19 +381,13 @@ impl Levels {
             line.clear();
             line.resize(out.len(), 0.0);
         }
-        if let (Some(metric), [r, g, b]) = (&rows.ground.metric, &rows.ground.surfaces[..]) {
-            let ground = [r, g, b].map(|surface| surface.along(row, column, step));
-            for (i, (d, p)) in difference.iter_mut().zip(source.as_chunks::<3>().0).enumerate() {
-                *d = metric.length([0, 1, 2].map(|c| f32::from(p[c]) - ground[c].at(i)));
+        if let Some(ground) = signed {
+            for (i, (d, p)) in difference.iter_mut().zip(source).enumerate() {
+                *d = self.sense * (f32::from(*p) - ground.at(i));
             }
-        }
-        let channel_by_channel = if rows.ground.metric.is_some() { &[] } else { &rows.ground.surfaces[..] };
-        for (c, ground) in channel_by_channel.iter().enumerate() {
-            let ground = ground.along(row, column, step);
-            for (i, (d, p)) in difference.iter_mut().zip(source.iter().skip(c).step_by(channels)).enumerate() {
-                let signed = f32::from(*p) - ground.at(i);
-                *d = if self.one_sided { self.sense * signed } else { d.max(signed.abs()) };
-            }
+        } else {
+            let values = |c: usize| source.iter().skip(c).step_by(channels).map(|p| f32::from(*p));
+            ground.fill_differences(values, difference);
         }
         self.fill_reciprocals(block, (y, from), reciprocals);
         for ((out, d), reciprocal) in out.iter_mut().zip(&*difference).zip(&*reciprocals) {

@@ -2,9 +2,9 @@
 
 use super::crop::Crop;
 use super::frame::Frame;
-use super::ground::median;
 use super::runs::Components;
 use super::segmentation::{Parameters, Reason, Rejected, Segmentation};
+use super::statistics::median;
 use crate::Point;
 use crate::contour::Border;
 use crate::cutout::Cutout;

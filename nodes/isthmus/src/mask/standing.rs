@@ -1,6 +1,7 @@
 //! What stands out from the ground, in blocks, and to which component each block belongs.
 
-use super::ground::{Blocks, Ground};
+use super::blocks::Blocks;
+use super::ground::Ground;
 use super::runs::Components;
 use std::ops::Range;
 

@@ -1,0 +1,119 @@
+//! A frame in blocks of pixels: what segmentation looks at before it looks at pixels.
+
+use super::frame::Frame;
+
+/// Blocks that are looked at to find the ground: a shape of a thousandth of the frame still has several among them.
+const SAMPLES: usize = 5_000;
+
+/// A block that is looked at.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Sample {
+    pub(super) block: usize,
+    // Of four bytes, so that they become floating point numbers in one step.
+    pub(super) column: u32,
+    pub(super) row: u32,
+}
+
+/// Means over square blocks of pixels.
+#[derive(Debug, Clone, Default)]
+pub(super) struct Blocks {
+    /// Pixels along the side of a block.
+    pub(super) size: usize,
+    pub(super) columns: usize,
+    pub(super) rows: usize,
+    /// One plane for a grey frame, three for a colour one.
+    pub(super) planes: Vec<Vec<f32>>,
+    /// The blocks that are looked at to find the ground, all over the frame.
+    pub(super) samples: Vec<Sample>,
+    sums: Vec<u16>,
+}
+
+impl Blocks {
+    /// Chooses the blocks that are looked at to find the ground.
+    fn choose_samples(&mut self) {
+        let (columns, rows) = (self.columns, self.rows);
+        let step = ((columns * rows) as f64 / SAMPLES as f64).sqrt().round().max(1.0) as usize;
+        // Frames of a few rows are looked at all along.
+        let (across, down) = if rows < step {
+            (step, 1)
+        } else if columns < step {
+            (1, step)
+        } else {
+            (step, step)
+        };
+        self.samples.clear();
+        for row in (0..rows).step_by(down) {
+            // Each row begins elsewhere, so that narrow upright shapes are hit as well.
+            let from = if columns > across { row / down % across } else { 0 };
+            for column in (from..columns).step_by(across) {
+                self.samples.push(Sample { block: row * columns + column, column: column as u32, row: row as u32 });
+            }
+        }
+    }
+
+    pub(super) fn fill(&mut self, frame: &Frame<'_>) {
+        let channels = frame.format.channels();
+        let (width, height) = (frame.width, frame.height);
+        self.size = block_size(width.min(height));
+        self.columns = width.div_ceil(self.size);
+        self.rows = height.div_ceil(self.size);
+        self.choose_samples();
+        self.planes.resize_with(channels, Vec::new);
+        for plane in &mut self.planes {
+            plane.clear();
+            plane.reserve(self.columns * self.rows);
+        }
+        for block_row in 0..self.rows {
+            let rows = block_row * self.size..height.min((block_row + 1) * self.size);
+            // The usual blocks are summed eight pixels at a time; what is left of the row goes the common way.
+            let done = match (&mut self.planes[..], self.size, rows.len()) {
+                ([plane], 4, 4) => sum_blocks([0, 1, 2, 3].map(|k| frame.row(rows.start + k)), plane),
+                _ => 0,
+            };
+            if done == width {
+                continue;
+            }
+            let count = rows.len();
+            self.sums.clear();
+            self.sums.resize((width - done) * channels, 0);
+            for y in rows {
+                for (sum, p) in self.sums.iter_mut().zip(&frame.row(y)[done * channels..]) {
+                    *sum += u16::from(*p);
+                }
+            }
+            for (c, plane) in self.planes.iter_mut().enumerate() {
+                plane.extend(self.sums.chunks(self.size * channels).map(|block| {
+                    let sum: u32 = block.iter().skip(c).step_by(channels).map(|s| u32::from(*s)).sum();
+                    sum as f32 / (block.len() / channels * count) as f32
+                }));
+            }
+        }
+    }
+}
+
+/// Appends the means of the blocks of 4 x 4 pixels of four rows, of two blocks at a time; gives the number of columns done.
+fn sum_blocks(rows: [&[u8]; 4], means: &mut Vec<f32>) -> usize {
+    /// Every other byte, and every other pair of bytes, of a word.
+    const BYTES: u64 = 0x00ff_00ff_00ff_00ff;
+    const PAIRS: u64 = 0x0000_ffff_0000_ffff;
+    let [a, b, c, d] = rows.map(|row| row.as_chunks::<8>().0);
+    let from = means.len();
+    means.resize(from + 2 * a.len(), 0.0);
+    let words = a.iter().zip(b).zip(c).zip(d).map(|(((a, b), c), d)| [a, b, c, d].map(|p| u64::from_le_bytes(*p)));
+    for (means, words) in means[from..].as_chunks_mut::<2>().0.iter_mut().zip(words) {
+        // Sums side by side in one word: of the pixels of a pair, then of two pairs. No sum outgrows its sixteen bits.
+        let pairs = words.iter().fold(0, |sum, w| sum + (w & BYTES) + (w >> 8 & BYTES));
+        let blocks = (pairs & PAIRS) + (pairs >> 16 & PAIRS);
+        *means = [blocks as u32 as i32, (blocks >> 32) as i32].map(|sum| sum as f32 / 16.0);
+    }
+    a.len() * 8
+}
+
+/// Side of a block in pixels: small pictures have small shapes.
+fn block_size(frame_side: usize) -> usize {
+    match frame_side {
+        0..128 => 1,
+        128..700 => 2,
+        _ => 4,
+    }
+}

@@ -1,0 +1,59 @@
+//! Statistics of lists of levels.
+
+/// Median absolute deviation of a normal distribution of standard deviation 1.
+pub(super) const NORMAL_MAD: f32 = 0.674_5;
+
+/// Two classes of values.
+pub(super) struct Split {
+    pub(super) threshold: f32,
+    /// Between-class part of the variance, 0 to 1.
+    pub(super) separation: f64,
+    /// Mean of the upper class.
+    pub(super) mean_above: f32,
+}
+
+/// The threshold that leaves the least variance within two classes (N. Otsu, *A threshold selection method from gray-level
+/// histograms*, IEEE Trans. SMC 9, 1979).
+pub(super) fn otsu(values: &[f32]) -> Split {
+    let mut histogram = [0u32; 256];
+    for v in values {
+        histogram[*v as u8 as usize] += 1;
+    }
+    let total = values.len() as f64;
+    let sum: f64 = histogram.iter().enumerate().map(|(v, n)| v as f64 * f64::from(*n)).sum();
+    let squares: f64 = histogram.iter().enumerate().map(|(v, n)| (v * v) as f64 * f64::from(*n)).sum();
+    let variance = squares / total - (sum / total).powi(2);
+    let mut best = Split { threshold: 255.0, separation: 0.0, mean_above: 255.0 };
+    let (mut below, mut below_sum, mut gain) = (0.0, 0.0, 0.0);
+    for (v, n) in histogram.iter().enumerate() {
+        below += f64::from(*n);
+        below_sum += v as f64 * f64::from(*n);
+        if below == 0.0 || below == total {
+            continue;
+        }
+        let (low, high) = (below_sum / below, (sum - below_sum) / (total - below));
+        let between = below * (total - below) * (high - low).powi(2);
+        if between > gain {
+            gain = between;
+            // Half-way between the class means, rather than at the first of many equally good thresholds.
+            let threshold = ((low + high) / 2.0) as f32;
+            let separation = if variance > 0.0 { between / (total * total) / variance } else { 0.0 };
+            best = Split { threshold, separation, mean_above: high as f32 };
+        }
+    }
+    best
+}
+
+/// Median of a list; 0 of an empty one.
+pub(super) fn median(mut values: Vec<f32>) -> f32 {
+    quantile(&mut values, 0.5)
+}
+
+/// Quantile of a list (which gets reordered); 0 of an empty one.
+pub(super) fn quantile(values: &mut [f32], q: f64) -> f32 {
+    if values.is_empty() {
+        return 0.0;
+    }
+    let k = ((values.len() - 1) as f64 * q) as usize;
+    *values.select_nth_unstable_by(k, f32::total_cmp).1
+}
