@@ -364,11 +364,12 @@ pub(crate) struct Closure {
 }
 
 impl Closure {
-    /// Before any loop is known: `narrow` from the noise of the borders, `wide` from the tolerance of the search.
-    pub(crate) fn guess(narrow: f64, wide: f64) -> Self {
+    /// Before any loop is known: `narrow` from the noise of the borders, `wide` from the tolerance of the search, and `any`,
+    /// the logarithm of the odds that there are true ones.
+    pub(crate) fn guess(narrow: f64, wide: f64, any: f64) -> Self {
         /// The least that is believed of it: what decoys don't show they may just have missed.
         const RATE: f64 = 0.01;
-        Self { narrow, right: 0.0, wide: wide.max(LEAST_RATIO * narrow), chance: 1.0, rate: RATE, any: f64::INFINITY }
+        Self { narrow, right: 0.0, wide: wide.max(LEAST_RATIO * narrow), chance: 1.0, rate: RATE, any }
     }
 
     /// Fits the two distributions to the loops found (maximum posterior over a grid of both scales; the counts by
@@ -387,8 +388,6 @@ impl Closure {
         const SETTLED: f64 = 1e-3;
         /// They grow from no less than this part, for from nothing they never would.
         const LEAST: f64 = 0.05;
-        /// A heap of pieces has true loops, before anything is seen: the natural logarithm of the odds.
-        const HEAP: f64 = 3.0;
         /// Loops that are looked at: more don't make the scales surer.
         const LOOPS: usize = 150;
         let sets = if decoys.sets > 0.0 { decoys.sets } else { 1.0 };
@@ -449,7 +448,7 @@ impl Closure {
                     - prior(narrow, guess.narrow, GUESS_DEVIATION)
                     - prior(*wide, decoy_wide, DECOY_DEVIATION);
                 if value > best.0 {
-                    let any = value - by_chance + HEAP;
+                    let any = value - by_chance + guess.any;
                     best =
                         (value, Self { narrow, right: right / share, wide: *wide, chance: chance / share, rate, any });
                 }

@@ -204,9 +204,13 @@ impl Outline {
             return None;
         }
         let (i, other, part) = self.walk(p, self.raster.nearest[cell] as usize);
-        let normal = self.normals[i] * (1.0 - part as f32) + self.normals[other] * part as f32;
-        let at = self.points[i] + (self.points[other] - self.points[i]) * part;
-        Some(Foot { offset: p - at, normal: normal.cast() })
+        let (here, there) = (self.normals[i].cast::<f64>(), self.normals[other].cast::<f64>());
+        let normal = here * (1.0 - part) + there * part;
+        let edge = self.points[other] - self.points[i];
+        // An arc between the two points, which rises over the chord where the normals diverge.
+        let turn = here.perp(&there) * if other == (i + 1) % self.points.len() { 1.0 } else { -1.0 };
+        let bulge = normal * (0.5 * self.spacing * part * (1.0 - part) * turn);
+        Some(Foot { offset: p - (self.points[i] + edge * part + bulge), normal })
     }
 
     /// Foot of a point on the border, downhill from the border point `from`: a border point, the neighbour towards which

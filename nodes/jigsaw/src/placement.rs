@@ -156,6 +156,7 @@ impl Quad {
     fn find(&mut self, run: &[Node], step: f32, (cos, sin, x, y): (f32, f32, f32, f32)) {
         let most = run.len() - 2;
         let last = (most + 1) as f32;
+        let half_spacing = 0.5 / step;
         for l in 0..LANES {
             self.px[l] = cos * self.x[l] - sin * self.y[l] + x;
             self.py[l] = sin * self.x[l] + cos * self.y[l] + y;
@@ -177,7 +178,10 @@ impl Quad {
             let (a, b) = (&here[l], &next[l]);
             self.nx[l] = lerp(a.nx, b.nx);
             self.ny[l] = lerp(a.ny, b.ny);
-            self.distance[l] = (self.px[l] - lerp(a.x, b.x)) * self.nx[l] + (self.py[l] - lerp(a.y, b.y)) * self.ny[l];
+            // Between two nodes lies an arc, which rises over the chord where the normals diverge.
+            let bulge = half_spacing * part * (1.0 - part) * (a.nx * b.ny - a.ny * b.nx);
+            self.distance[l] =
+                (self.px[l] - lerp(a.x, b.x)) * self.nx[l] + (self.py[l] - lerp(a.y, b.y)) * self.ny[l] - bulge;
             self.mask[l] = if moved[l] == self.at[l] { self.present[l] } else { 0.0 };
         }
     }

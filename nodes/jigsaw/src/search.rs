@@ -147,7 +147,7 @@ pub(crate) fn assemble(
         },
         learnt: false,
         present: 0.0,
-        closure: Closure::guess(0.02, 1.0),
+        closure: Closure::guess(0.02, 1.0, 0.0),
         aside: vec![false; n],
         state: State::new(n, &slots),
         slots,

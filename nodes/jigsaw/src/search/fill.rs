@@ -5,7 +5,8 @@
 //! 1. *Fit*: how badly it fits there ([`super::fit`]).
 //! 2. *Decision*: how large that figure is for pieces that are placed, and for strangers in the places of such, is
 //!    measured, and how many strangers overlap so much that they drop out, the more the more the place is enclosed; a
-//!    piece is placed if it fits like one of the former, given how many places were tried for it, and leads its rivals.
+//!    piece is placed if it fits like one of the former, given how many places were tried for it and are free, and leads
+//!    its rivals.
 //! 3. *Small islands* that would not join are taken apart and filled in likewise, all of their pieces or none.
 //!
 //! Complexity O(pieces left · candidates · neighbours · border) in each round; a round places all that are sure. A piece
@@ -60,6 +61,8 @@ struct Trial {
     misfit: Misfit,
     /// Poses in which this piece was tried.
     tries: usize,
+    /// Places in which it was tried and didn't overlap.
+    free: usize,
 }
 
 /// How pieces fit that are placed, and how strangers do in their places.
@@ -103,7 +106,11 @@ impl Fitting {
         costs.truncate(costs.len().div_ceil(BEST));
         let wrong = if costs.len() < FEW { (self.right.0 + STRANGE, self.right.1) } else { spread_of(&mut costs) };
         let model = Model::between(self.right, wrong);
-        model.evidence(trial.misfit.cost).min(near) + rarity.ln() - (trial.tries.max(1) as f64).ln()
+        // So many strangers would be free by chance. How many are varies from place to place far more than independent tries
+        // would: like a count whose rate is exponential, P(n) = q^n (1 - q), of which the piece is one more.
+        let chance = trial.tries.max(1) as f64 / rarity;
+        let one_more = (1.0 + chance) / (chance * trial.free.max(1) as f64);
+        model.evidence(trial.misfit.cost).min(near) + one_more.ln()
     }
 
     /// Logarithm of how much likelier a cost is for a piece that is placed than for one of the strangers as they are (kernel
@@ -177,7 +184,9 @@ impl Assembler<'_> {
                 // What has been placed beside it meanwhile has a say.
                 let now = self.place_of(t.edge, t.piece, None).and_then(|place| self.trial(&place, learnt));
                 let now = now.filter(|now| now.misfit.overlap <= self.tolerated_here());
-                let now = now.map(|now| Trial { tries: t.tries, ..now }).map(|now| (self.evidence(learnt, &now), now));
+                let now = now
+                    .map(|now| Trial { tries: t.tries, free: t.free, ..now })
+                    .map(|now| (self.evidence(learnt, &now), now));
                 let Some((evidence, now)) = now.filter(|now| now.0 >= FOUND && self.free(t.edge)) else { continue };
                 self.place(&now, evidence);
                 islands.push(now.island);
@@ -259,6 +268,8 @@ impl Assembler<'_> {
                     kept.push(Trial { tries, ..*t });
                 }
             }
+            let free = kept.len() - first;
+            kept[first..].iter_mut().for_each(|t| t.free = free);
         }
         for t in &kept {
             let of = self.fits_like(t.island);
@@ -274,7 +285,16 @@ impl Assembler<'_> {
         let most = learnt.get(&self.fits_like(place.island))?.as_ref()?.most();
         let (pose, misfit) = self.fit(place, most)?;
         let Place { piece, edge, island, .. } = *place;
-        Some(Trial { piece, edge, island, pose, centre: pose * self.outlines[piece].centroid, misfit, tries: 1 })
+        Some(Trial {
+            piece,
+            edge,
+            island,
+            pose,
+            centre: pose * self.outlines[piece].centroid,
+            misfit,
+            tries: 1,
+            free: 1,
+        })
     }
 
     /// The pieces by which it is judged how one fits in an island: those of the island if they are many enough (puzzles in

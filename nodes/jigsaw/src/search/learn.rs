@@ -18,6 +18,9 @@ const LOOSE: Tolerance = Tolerance { position: 0.04, angle: 0.05 };
 /// True loops close this many times as wide as the borders' residuals say, as a first guess: neighbouring residuals
 /// are alike (1 to 2 on generated pieces, 4 to 12 on real ones, which don't keep their shape exactly).
 const STIFFNESS: f64 = 3.0;
+/// A heap of pieces that all have a candidate standing out has true loops, before anything is seen of them: the natural
+/// logarithm of the odds.
+const LOOPS: f64 = 3.0;
 /// Candidates of each mouth (and tab) that take part in loops: more and chance loops drown the true ones.
 const LOOP_RANKS: usize = 6;
 /// The same for the loops by which the puzzle is calibrated.
@@ -119,7 +122,10 @@ impl Assembler<'_> {
         let open = |e: &Edge| (64.0 * e.covariance.determinant()).max(f64::MIN_POSITIVE).sqrt();
         let open = median(&mut best.map(open).collect::<Vec<f64>>()).unwrap_or(1.0);
         let volume = (LOOSE.position * self.scale).powi(2) * LOOSE.angle;
-        Closure::guess(STIFFNESS * residual, (volume / open).cbrt())
+        // The fewer mouths have a candidate that stands out, the less is there to make loops of, or to tell them by.
+        let mouths = self.edges.iter().filter(|e| e.mouth_rank == 0).count();
+        let outstanding = (self.outstanding().len() as f64 + 1.0) / (mouths as f64 + 1.0);
+        Closure::guess(STIFFNESS * residual, (volume / open).cbrt(), LOOPS + outstanding.ln())
     }
 
     /// Counts what supports what, leaves out loops that are more likely chance, and puts the best first.
