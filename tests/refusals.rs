@@ -173,15 +173,15 @@ fn features() {
         "/isthmuses/0/critical_points_px",
     ];
     let also: [(&str, &[&str]); 11] = [
-        ("x", &["point_px"]),
-        ("y", &["point_px"]),
+        ("x", &["point_px", "arc_px"]),
+        ("y", &["point_px", "arc_px"]),
         ("border_x_px", &["border"]),
         ("border_y_px", &["border"]),
         ("x_px", &["skeleton"]),
         ("y_px", &["skeleton"]),
         ("distance_px", &["skeleton"]),
-        ("width_px", &[]),
-        ("arc_px", &[]),
+        ("width_px", &["arc_px"]),
+        ("arc_px", &["path_length_px"]),
         ("persistence_px", &[]),
         ("border_length_px", &[]),
     ];
@@ -225,6 +225,32 @@ fn numbers_that_are_none_are_refused_in_every_float() {
         change(&mut message);
         let said = feature::convert::cutout(&mut message).unwrap_err().to_string();
         assert!(said.contains(field) && said.contains("NaN"), "{field}: {said}");
+    }
+}
+
+#[test]
+fn isthmuses_lie_where_they_say() {
+    let cases: [Case<PieceFeatures>; 4] = [
+        ("arc_px", &|m| m.isthmuses[0].arc_px = [0.0; 2]),
+        // The border begins elsewhere than when the arcs were measured.
+        ("arc_px", &|m| {
+            let third = m.border_x_px.len() / 3;
+            m.border_x_px.rotate_left(third);
+            m.border_y_px.rotate_left(third);
+        }),
+        // From the second critical point to the first.
+        ("path_length_px", &|m| {
+            m.isthmuses[0].arc_px.reverse();
+            m.isthmuses[0].critical_points_px.reverse();
+        }),
+        ("path_length_px", &|m| m.isthmuses[0].path_length_px *= 0.5),
+    ];
+    for (field, change) in cases {
+        let mut message = piece_features();
+        solver::convert::piece(&message).unwrap();
+        change(&mut message);
+        let said = solver::convert::piece(&message).unwrap_err().to_string();
+        assert!(said.contains(field), "{field}: {said}");
     }
 }
 

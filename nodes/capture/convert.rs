@@ -253,7 +253,7 @@ fn raw_pixels(topic: &str, image: &Image) -> Result<DynamicImage, FrameError> {
     }
     let picture = match layout {
         Layout::Grey => GrayImage::from_raw(width, height, packed).map(DynamicImage::ImageLuma8),
-        Layout::Grey16 => GrayImage::from_raw(width, height, stretched(&packed, image.is_bigendian != 0))
+        Layout::Grey16 => GrayImage::from_raw(width, height, stretched(&levels(&packed, image.is_bigendian != 0)))
             .map(DynamicImage::ImageLuma8),
         Layout::Rgb | Layout::Bgr => RgbImage::from_raw(width, height, packed).map(DynamicImage::ImageRgb8),
         Layout::Rgba | Layout::Bgra => RgbaImage::from_raw(width, height, packed).map(DynamicImage::ImageRgba8),
@@ -261,13 +261,14 @@ fn raw_pixels(topic: &str, image: &Image) -> Result<DynamicImage, FrameError> {
     picture.ok_or_else(|| FrameError::Size { source_name: topic.to_owned(), width, height })
 }
 
-/// 16-bit greys as 8-bit ones over the range they use: cameras of 10 to 14 bits fill but a part of the 16.
-fn stretched(data: &[u8], big_endian: bool) -> Vec<u8> {
-    let level = |pair: &[u8]| {
-        let pair = [pair[0], pair[1]];
-        if big_endian { u16::from_be_bytes(pair) } else { u16::from_le_bytes(pair) }
-    };
-    let levels: Vec<u16> = data.chunks_exact(2).map(level).collect();
+/// The numbers of 16 bits that bytes are.
+fn levels(data: &[u8], big_endian: bool) -> Vec<u16> {
+    let level = |pair: &[u8; 2]| if big_endian { u16::from_be_bytes(*pair) } else { u16::from_le_bytes(*pair) };
+    data.as_chunks::<2>().0.iter().map(level).collect()
+}
+
+/// 16-bit levels as 8-bit ones over the range they use: cameras of 10 to 14 bits fill but a part of the 16.
+fn stretched(levels: &[u16]) -> Vec<u8> {
     let (low, high) = levels.iter().fold((u16::MAX, 0), |(low, high), &v| (low.min(v), high.max(v)));
     let range = u32::from(high.saturating_sub(low)).max(1);
     levels.iter().map(|&v| (u32::from(v - low) * 255 / range) as u8).collect()
@@ -321,15 +322,46 @@ pub enum Pixels {
 }
 
 impl From<DynamicImage> for Pixels {
+    /// What is transparent is ground, whatever colour it has: of a picture that is transparent in parts only the transparency counts.
     fn from(image: DynamicImage) -> Self {
+        let [width, height] = [image.width(), image.height()];
+        if let Some(opacity) = opacity(&image) {
+            return Self::Grey(opacity);
+        }
         match image {
             DynamicImage::ImageLuma8(grey) => Self::Grey(grey),
-            DynamicImage::ImageLuma16(_) | DynamicImage::ImageLumaA8(_) | DynamicImage::ImageLumaA16(_) => {
-                Self::Grey(image.into_luma8())
+            DynamicImage::ImageLumaA8(_) => Self::Grey(image.into_luma8()),
+            DynamicImage::ImageLuma16(_) | DynamicImage::ImageLumaA16(_) => {
+                let mut grey = GrayImage::new(width, height);
+                grey.copy_from_slice(&stretched(&image.into_luma16()));
+                Self::Grey(grey)
+            }
+            DynamicImage::ImageRgb16(_) | DynamicImage::ImageRgba16(_) => {
+                let mut colour = RgbImage::new(width, height);
+                colour.copy_from_slice(&stretched(&image.into_rgb16()));
+                Self::Rgb(colour)
             }
             colour => Self::Rgb(colour.into_rgb8()),
         }
     }
+}
+
+/// Least part of a picture that is transparent where that means ground: the rounded corners of a window take less.
+const MIN_TRANSPARENT: f64 = 0.02;
+/// Alpha from which on a pixel counts as opaque: half.
+const OPAQUE: u8 = 128;
+
+/// The alpha channel of a picture that has opaque and transparent parts.
+fn opacity(image: &DynamicImage) -> Option<GrayImage> {
+    let alpha: Vec<u8> = match image {
+        DynamicImage::ImageLumaA8(picture) => picture.pixels().map(|p| p.0[1]).collect(),
+        DynamicImage::ImageRgba8(picture) => picture.pixels().map(|p| p.0[3]).collect(),
+        _ if image.color().has_alpha() => image.to_rgba8().pixels().map(|p| p.0[3]).collect(),
+        _ => return None,
+    };
+    let transparent = alpha.iter().filter(|a| **a < OPAQUE).count();
+    let is_cut_out = transparent < alpha.len() && transparent as f64 >= MIN_TRANSPARENT * alpha.len() as f64;
+    is_cut_out.then(|| GrayImage::from_raw(image.width(), image.height(), alpha)).flatten()
 }
 
 impl Pixels {
@@ -466,6 +498,50 @@ mod tests {
             let big = Image { is_bigendian: 1, ..image(encoding, 2, &big) };
             assert_eq!(read(image(encoding, 2, &little)).unwrap().to_luma8().as_raw(), &expected, "{encoding}");
             assert_eq!(read(big).unwrap().to_luma8().as_raw(), &expected, "{encoding}");
+        }
+    }
+
+    #[test]
+    fn sixteen_bits_of_a_file_are_stretched_as_those_of_a_camera() {
+        let grey = image::ImageBuffer::from_raw(2, 2, vec![0_u16, 1000, 2000, 4000]).map(DynamicImage::ImageLuma16);
+        let Pixels::Grey(grey) = Pixels::from(grey.unwrap()) else { panic!("grey") };
+        assert_eq!(grey.as_raw(), &[0, 63, 127, 255]);
+        let colour = image::ImageBuffer::from_raw(2, 1, vec![0_u16, 1000, 2000, 4000, 0, 1000]);
+        let Pixels::Rgb(colour) = Pixels::from(colour.map(DynamicImage::ImageRgb16).unwrap()) else { panic!("rgb") };
+        assert_eq!(colour.as_raw(), &[0, 63, 127, 255, 0, 63]);
+    }
+
+    #[test]
+    fn transparency_is_ground_whatever_colour_it_hides() {
+        /// A square of this opacity on a transparent ground, all of one colour.
+        fn square(alpha: u8) -> DynamicImage {
+            let is_within = |v: u32| (8..24).contains(&v);
+            DynamicImage::ImageRgba8(RgbaImage::from_fn(32, 32, |x, y| {
+                image::Rgba([90, 60, 30, if is_within(x) && is_within(y) { alpha } else { 0 }])
+            }))
+        }
+        let shapes = |picture: DynamicImage| {
+            let pixels = Pixels::from(picture);
+            let segmentation = mask::segment(&pixels.frame().unwrap(), &mask::Parameters::default());
+            segmentation.cutouts.iter().map(|c| (c.aoi.x, c.aoi.y, c.aoi.width, c.aoi.height)).collect::<Vec<_>>()
+        };
+        let expected = [(8, 8, 16, 16)];
+        assert_eq!(shapes(square(255)), expected);
+        let sixteen_bits = DynamicImage::ImageRgba16(square(255).into_rgba16());
+        assert_eq!(shapes(sixteen_bits), expected);
+        assert_eq!(shapes(DynamicImage::ImageLumaA8(square(255).into_luma_alpha8())), expected);
+    }
+
+    #[test]
+    fn transparency_that_tells_no_parts_apart_is_passed_over() {
+        let picture = |alpha: fn(u32) -> u8| {
+            let pixel = |x: u32, y: u32| image::Rgba([x as u8, 2, 3, alpha(x + 100 * y)]);
+            Pixels::from(DynamicImage::ImageRgba8(RgbaImage::from_fn(100, 100, pixel)))
+        };
+        let alphas: [fn(u32) -> u8; 3] = [|_| 255, |_| 0, |at| if at < 100 { 0 } else { 255 }];
+        for alpha in alphas {
+            let Pixels::Rgb(colour) = picture(alpha) else { panic!("rgb") };
+            assert_eq!(colour.get_pixel(7, 50).0, [7, 2, 3]);
         }
     }
 

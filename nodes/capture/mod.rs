@@ -9,8 +9,6 @@ pub mod known;
 pub mod params;
 pub mod source;
 
-use std::collections::VecDeque;
-use std::hash::{DefaultHasher, Hash, Hasher};
 use std::path::PathBuf;
 use std::sync::Arc;
 
@@ -18,7 +16,6 @@ use futures::channel::mpsc;
 use futures::stream::{self, LocalBoxStream};
 use futures::{Sink, SinkExt, Stream, StreamExt};
 use isthmus::mask::{self, Cutout};
-use jigsaw_msgs::builtin_interfaces::msg::Time;
 use jigsaw_msgs::msg::PieceImage;
 use jigsaw_msgs::std_msgs::msg::Empty;
 use jigsaw_msgs::std_srvs::srv::{Trigger, TriggerResponse};
@@ -55,29 +52,6 @@ struct Seen {
     left_out: Vec<String>,
 }
 
-/// The latest compressed frames, by stamp and content: one that comes through two subscriptions is worked on once.
-#[derive(Debug, Default)]
-struct Heard(VecDeque<u64>);
-
-impl Heard {
-    /// How far one subscription may run ahead of the other: the depth of the deeper one.
-    const DEPTH: usize = 1000;
-
-    fn is_new(&mut self, stamp: &Time, data: &[u8]) -> bool {
-        let mut hasher = DefaultHasher::new();
-        (stamp.sec, stamp.nanosec, data).hash(&mut hasher);
-        let key = hasher.finish();
-        if self.0.contains(&key) {
-            return false;
-        }
-        if self.0.len() == Self::DEPTH {
-            self.0.pop_front();
-        }
-        self.0.push_back(key);
-        true
-    }
-}
-
 /// Opens the node with its own topics and gives its loop.
 ///
 /// # Errors
@@ -107,19 +81,7 @@ pub fn open(
             let (raw_name, compressed_name) =
                 (session.names().topic(topics::IMAGE.name)?, session.names().topic(topics::IMAGE_COMPRESSED.name)?);
             let raw = session.subscribe(&topics::IMAGE)?;
-            // A reliable subscription does not hear a best-effort camera, and a best-effort one may lose frames of a
-            // reliable camera: with both, each is heard as well as it can be, and what comes twice is taken once.
-            let reliability = session.parameters.text(&params::COMPRESSED_RELIABILITY);
-            let mut compressed = Vec::new();
-            if reliability != "best_effort" {
-                compressed.push(session.subscribe(&topics::IMAGE_COMPRESSED)?);
-            }
-            if reliability != "reliable" {
-                compressed.push(session.subscribe(&topics::IMAGE_COMPRESSED_BEST_EFFORT)?);
-            }
-            let mut heard = Heard::default();
-            let compressed = stream::select_all(compressed)
-                .filter(move |image| std::future::ready(heard.is_new(&image.header.stamp, &image.data)));
+            let compressed = session.subscribe_to_all(&topics::IMAGE_COMPRESSED)?;
             let frames = stream::select(
                 raw.map(move |image| Frame::Raw(raw_name.clone(), image)),
                 compressed.map(move |image| Frame::Compressed(compressed_name.clone(), image)),
@@ -312,19 +274,4 @@ fn cut_out(frame: Frame) -> Result<Seen, FrameError> {
         head: FrameHead { header: picture.header, source, width, height },
         cutouts: segmentation.cutouts,
     })
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn a_frame_that_comes_twice_is_heard_once() {
-        let mut heard = Heard::default();
-        let [first, second] = [1, 2].map(|sec| Time { sec, nanosec: 0 });
-        assert!(heard.is_new(&first, &[1, 2]));
-        assert!(heard.is_new(&second, &[1, 2]), "another stamp is another frame");
-        assert!(heard.is_new(&first, &[1, 3]), "other content is another frame");
-        assert!(!heard.is_new(&first, &[1, 2]));
-    }
 }

@@ -36,17 +36,6 @@ pub const SAME_PLACE_OVERLAP: Spec = Spec {
     read_only: false,
 };
 
-/// Reliability of the subscription of compressed frames.
-pub const COMPRESSED_RELIABILITY: Spec = Spec {
-    name: "compressed_reliability",
-    default: Default::Text("any"),
-    unit: "",
-    rule: Rule::OneOf(&["any", "reliable", "best_effort"]),
-    description: "Quality of service asked for on image/compressed; any hears every camera, the frames of a reliable \
-                  one twice over the network.",
-    read_only: true,
-};
-
 /// Frames worked on at a time.
 pub const THREADS: Spec = Spec {
     name: "threads",
@@ -58,7 +47,7 @@ pub const THREADS: Spec = Spec {
 };
 
 /// All of them.
-pub const PARAMETERS: &[Spec] = &[SOURCE, METRES_PER_PIXEL, SAME_PLACE_OVERLAP, COMPRESSED_RELIABILITY, THREADS];
+pub const PARAMETERS: &[Spec] = &[SOURCE, METRES_PER_PIXEL, SAME_PLACE_OVERLAP, THREADS];
 
 /// The folder that was given, if any.
 pub fn source_folder(parameters: &Parameters) -> Option<PathBuf> {

@@ -13,9 +13,10 @@ use jigsaw_msgs::sensor_msgs::msg::Image;
 use crate::capture::params::threads;
 use crate::picture::{InspectionStyle, inspection};
 use crate::ros::activity::WhileInactive;
+use crate::ros::discovery::Audience;
 use crate::ros::lifecycle::Forget;
 use crate::ros::process::{ProcessError, Program, Work};
-use crate::ros::session::{Audience, CHANNEL_DEPTH, Session, Settings};
+use crate::ros::session::{CHANNEL_DEPTH, Session, Settings};
 use crate::ros::topics;
 use convert::PieceImageError;
 

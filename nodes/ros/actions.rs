@@ -127,10 +127,12 @@ impl Session {
             )
             .map_err(fail)?;
         let library = |e: ros2_client::CreateError| SessionError::middleware(format!("action {name}"), e);
+        let feedback = self.node.borrow_mut().create_publisher(&feedback, None).map_err(library)?;
+        let statuses = self.node.borrow_mut().create_publisher(&status, None).map_err(library)?;
         let (goals, receiver) = mpsc::channel(CHANNEL_DEPTH);
         let server = Server::<A> {
-            feedback: self.node.create_publisher(&feedback, None).map_err(library)?,
-            statuses: self.node.create_publisher(&status, None).map_err(library)?,
+            feedback,
+            statuses,
             goals,
             health: Arc::clone(&self.health),
             clock: self.clock.clone(),

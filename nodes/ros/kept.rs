@@ -21,7 +21,8 @@ use jigsaw_msgs::Message;
 use jigsaw_msgs::msg::PiecesForgotten;
 use rustdds::GUID;
 
-use super::session::{Audience, CHANNEL_DEPTH, Session, SessionError};
+use super::discovery::Audience;
+use super::session::{CHANNEL_DEPTH, Session, SessionError};
 use super::topics::{self, Topic};
 
 /// How long pieces are kept back: far longer than the word takes that was sent ahead of them.
@@ -73,7 +74,7 @@ impl Session {
             number: u64::try_from(info.sequence_number()).unwrap_or_default(),
         };
         let mut words = self.subscribe_as(&topics::PIECES_FORGOTTEN, move |word, info| (word, origin(&info)))?;
-        let mut pieces = self.subscribe_as(topic, move |piece, info| (piece, origin(&info)))?;
+        let mut pieces = self.subscribe_to_all_as(topic, move |piece, info| (piece, origin(&info)))?;
         let announced = self.writers_of(&topics::PIECES_FORGOTTEN)?;
         let (mut sender, receiver) = mpsc::channel(CHANNEL_DEPTH);
         self.spawn(async move {

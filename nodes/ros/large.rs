@@ -5,14 +5,26 @@
 //! RustDDS 0.15 writes a byte too many, so that no client can read it. So such an answer is sent once more from here, in the
 //! name of its writer and under its number: for the client it is a message like any other, which it acknowledges, and what it could
 //! not read it has passed over. What is lost on the way is not asked for here, so all of it is sent several times.
+//!
+//! What RustDDS sends whole must not be sent from here: Fast DDS notes in the content of a message which of its fragments are still
+//! missing, and such notes stay in it where the whole message comes between them. So which way RustDDS goes is told as it does
+//! (`Writer::max_unfragmented_serialized_payload`), by what the interfaces on the way carry.
 
-use std::net::{Ipv4Addr, SocketAddr, UdpSocket};
+use std::net::{IpAddr, Ipv4Addr, SocketAddr, UdpSocket};
 use std::time::Duration;
 
+use netdev::Interface;
+use rustdds::discovery::ReaderProxy;
 use rustdds::{DomainParticipant, GUID, SampleIdentity};
 
 /// Bytes of an answer that every datagram holds beside all that goes with it.
 pub(super) const FRAGMENT: u16 = 1024;
+
+/// What an interface carries, in bytes, that tells nothing of it, or none on the way: an Ethernet frame.
+const USUAL_MTU: usize = 1500;
+/// Bytes of a datagram, as RustDDS counts them, that go with the content of a message: headers of IP, UDP and RTPS, heartbeat, and
+/// head of the submessage.
+const BESIDE: usize = 48 + 32 + 48;
 
 /// What stands before the content: encoding (CDR, little endian) and options.
 const ENCODING: [u8; 4] = [0, 1, 0, 0];
@@ -23,25 +35,38 @@ const PAUSES: [Duration; 3] = [Duration::ZERO, Duration::from_millis(50), Durati
 /// Numbers under which a message names the request that it answers: that of the standard, and what Fast DDS had before.
 const RELATED: [u16; 2] = [0x0083, 0x800f];
 
-/// Sends an answer to the readers of the client, several times, from a thread beside.
-pub(super) fn send(participant: &DomainParticipant, answer: SampleIdentity, request: SampleIdentity, content: &[u8]) {
-    let client = request.writer_guid.prefix;
-    let mut parcels = Vec::new();
-    for reader in participant.discovered_readers().iter().map(|known| &known.reader_proxy) {
-        let guid = reader.remote_reader_guid;
-        let named = request.writer_guid.entity_id.kind().is_reader();
-        if guid.prefix == client && (!named || guid == request.writer_guid) {
-            let addresses = reader.unicast_locator_list.iter().filter(|locator| locator.is_udp());
-            let addresses: Vec<_> = addresses.map(|l| SocketAddr::from(*l)).filter(SocketAddr::is_ipv4).collect();
-            parcels.push((addresses, fragments(answer, guid, request, content)));
-        }
-    }
+/// Sends an answer that RustDDS fragments to the readers of the client, several times, from a thread beside.
+pub(super) fn send(participant: &DomainParticipant, answer: SampleIdentity, request: SampleIdentity, content: Vec<u8>) {
+    let known = participant.discovered_readers();
+    let addresses = |reader: &ReaderProxy| -> Vec<SocketAddr> {
+        reader.unicast_locator_list.iter().filter(|l| l.is_udp()).map(|l| SocketAddr::from(*l)).collect()
+    };
+    let named = request.writer_guid.entity_id.kind().is_reader();
+    let is_of_client =
+        |guid: GUID| guid.prefix == request.writer_guid.prefix && (!named || guid == request.writer_guid);
+    let clients: Vec<_> = known.iter().filter(|r| is_of_client(r.reader_proxy.remote_reader_guid)).collect();
+    let readers: Vec<(GUID, Vec<SocketAddr>)> =
+        clients.iter().map(|r| (r.reader_proxy.remote_reader_guid, addresses(&r.reader_proxy))).collect();
+    let on_the_way: Vec<IpAddr> = if named {
+        readers.iter().flat_map(|(_, addresses)| addresses).map(SocketAddr::ip).collect()
+    } else {
+        // The answer goes to all readers of the topic as to the one that takes least.
+        let topics: Vec<&String> = clients.iter().map(|r| r.subscription_topic_data.topic_name()).collect();
+        let of_topic = known.iter().filter(|r| topics.contains(&r.subscription_topic_data.topic_name()));
+        of_topic.flat_map(|r| addresses(&r.reader_proxy)).map(|address| address.ip()).collect()
+    };
     smol::unblock(move || {
+        if ENCODING.len() + content.len() <= most_whole(&netdev::get_interfaces(), &on_the_way) {
+            return;
+        }
+        let parcels: Vec<_> =
+            readers.into_iter().map(|(guid, to)| (to, fragments(answer, guid, request, &content))).collect();
         let Ok(socket) = UdpSocket::bind((Ipv4Addr::UNSPECIFIED, 0)) else { return };
         for pause in PAUSES {
             std::thread::sleep(pause);
             for (addresses, messages) in &parcels {
-                for (message, address) in messages.iter().flat_map(|m| addresses.iter().map(move |a| (m, a))) {
+                let addresses = || addresses.iter().filter(|a| a.is_ipv4());
+                for (message, address) in messages.iter().flat_map(|m| addresses().map(move |a| (m, a))) {
                     // An address that can't be reached from here is one of several.
                     let _ = socket.send_to(message, address);
                 }
@@ -49,6 +74,16 @@ pub(super) fn send(participant: &DomainParticipant, answer: SampleIdentity, requ
         }
     })
     .detach();
+}
+
+/// Most bytes of content that RustDDS sends to these addresses in one piece: what fits the narrowest way.
+fn most_whole(interfaces: &[Interface], addresses: &[IpAddr]) -> usize {
+    let mtu = |address: &IpAddr| {
+        let IpAddr::V4(address) = address else { return USUAL_MTU };
+        let beside = interfaces.iter().filter(|i| i.ipv4.iter().any(|net| net.contains(address)));
+        beside.filter_map(|i| i.mtu).map(|mtu| mtu as usize).next().unwrap_or(USUAL_MTU)
+    };
+    addresses.iter().map(mtu).min().unwrap_or(USUAL_MTU).saturating_sub(BESIDE)
 }
 
 /// RTPS messages (9.4) of one fragment each: header, INFO_DST, DATA_FRAG with inline quality of service.
@@ -100,6 +135,24 @@ mod tests {
     use rustdds::SequenceNumber;
 
     use super::*;
+
+    #[test]
+    fn what_fits_the_narrowest_way_goes_whole() {
+        let mut lo = Interface::dummy();
+        lo.ipv4 = vec!["127.0.0.1/8".parse().unwrap()];
+        lo.mtu = Some(65536);
+        let mut wide = Interface::dummy();
+        wide.ipv4 = vec!["10.1.0.7/16".parse().unwrap()];
+        wide.mtu = Some(9000);
+        let interfaces = [lo, wide];
+        let most = |addresses: &[[u8; 4]]| {
+            most_whole(&interfaces, &addresses.iter().map(|a| IpAddr::from(*a)).collect::<Vec<_>>())
+        };
+        assert_eq!(most(&[[127, 0, 0, 1]]), 65536 - BESIDE);
+        assert_eq!(most(&[[127, 0, 0, 1], [10, 1, 2, 3]]), 9000 - BESIDE);
+        assert_eq!(most(&[[10, 1, 2, 3], [192, 168, 0, 1]]), USUAL_MTU - BESIDE);
+        assert_eq!(most(&[]), USUAL_MTU - BESIDE);
+    }
 
     #[test]
     fn the_fragments_are_the_answer() {

@@ -18,6 +18,7 @@
 //! | [`topics`] | every topic: message type, name, quality of service |
 //! | [`raw`] | topics whose type is known by name only |
 //! | [`session`] | one node: opens topics and services as streams and sinks |
+//! | [`discovery`] | who listens, who offers or asks for too little, who was forgotten and comes back |
 //! | [`kept`] | latched pieces, and which of them are forgotten |
 //! | [`peers`] | discovery without multicast |
 //! | `farewell` | says that a process leaves |
@@ -30,6 +31,7 @@
 pub mod actions;
 pub mod activity;
 pub mod args;
+pub mod discovery;
 mod farewell;
 pub mod health;
 pub mod kept;

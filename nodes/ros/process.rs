@@ -16,7 +16,7 @@
 //! has taken its announcements of endpoints once and takes them for known when they come again. A node that sees that ends
 //! as well; with its new identity both sides find each other as new.
 
-use std::collections::VecDeque;
+use std::cell::RefCell;
 use std::net::{IpAddr, Ipv4Addr};
 use std::path::Path;
 use std::process::ExitCode;
@@ -33,17 +33,17 @@ use jigsaw_msgs::std_msgs::msg::Header;
 use nix::sys::resource::{Resource, getrlimit, setrlimit};
 use nix::sys::signal::{SigSet, Signal};
 use ros2_client::{Context, NodeName, NodeOptions};
-use rustdds::dds::statusevents::{DomainParticipantStatusEvent, LostReason, StatusEvented};
 use rustdds::{DomainParticipant, DomainParticipantBuilder, RTPSEntity};
 
 use super::activity::Activity;
 use super::args::{ArgsError, RosArgs, domain_id};
+use super::discovery::{Endpoints, Estranged};
 use super::farewell::Farewell;
 use super::health::Health;
 use super::params::{Default as DefaultValue, ParameterError, Parameters, Rule, Spec};
-use super::session::{Clock, Endpoints, Session, SessionError};
+use super::session::{Clock, Session, SessionError};
 use super::turn::Turn;
-use super::{logging, missed, peers, security, services, topics};
+use super::{discovery, logging, peers, security, services, topics};
 
 /// Whether a node starts to work by itself.
 pub const AUTOSTART: Spec = Spec {
@@ -110,9 +110,6 @@ const REPORT_PERIOD: Duration = Duration::from_secs(1);
 /// need not kill it.
 const END_PATIENCE: Duration = Duration::from_millis(800);
 
-/// Most participants that are remembered as forgotten; beyond, those that have been away longest are not expected back.
-const MOST_FORGOTTEN: usize = 1024;
-
 /// Beginning of the names of RustDDS's threads.
 const MIDDLEWARE_THREADS: &str = "RustDDS";
 
@@ -144,10 +141,8 @@ pub enum ProcessError {
     #[error("the middleware has gone deaf (its thread '{0}' ended, as it does after SIGSTOP); start this node again")]
     Deaf(String),
     /// One that was forgotten has come back.
-    #[error(
-        "participant {0} was away for longer than its lease and has come back, and the middleware can't find its topics again; start this node again"
-    )]
-    Estranged(String),
+    #[error(transparent)]
+    Estranged(#[from] Estranged),
 }
 
 impl ProcessError {
@@ -320,7 +315,7 @@ impl Process {
         let health = Arc::new(Health::new(&names.full_name()));
         let mut session = Session {
             context,
-            node,
+            node: Rc::new(RefCell::new(node)),
             names,
             executor: Rc::clone(&self.executor),
             endpoints: self.endpoints.clone(),
@@ -370,7 +365,7 @@ impl Process {
             })
             .map_err(|e| ProcessError::System { what: "starting a thread", reason: e.to_string() })?;
         let participant = self.participant.as_ref().map(|(participant, _)| participant.clone());
-        let discovery = follow_discovery(participant, self.endpoints.clone(), self.started_again);
+        let discovery = discovery::follow(participant, self.endpoints.clone(), self.started_again);
         if let Some(turn) = self.turn.take() {
             self.executor.spawn(turn.done()).detach();
         }
@@ -381,7 +376,7 @@ impl Process {
                 result = work.fuse() => result,
                 _ = signalled.fuse() => Ok(()),
                 error = watchdog().fuse() => Err(error),
-                error = Box::pin(discovery).fuse() => Err(error),
+                estranged = Box::pin(discovery).fuse() => Err(estranged.into()),
             }
         }));
         logging::remove_nodes();
@@ -567,82 +562,6 @@ fn report(session: &mut Session) -> Result<(), SessionError> {
         }
     });
     Ok(())
-}
-
-/// Keeps account of who listens, and warns of those who would but can't. Resolves when one that was forgotten comes back,
-/// if this process is started again then; otherwise that is a warning, too.
-async fn follow_discovery(
-    participant: Option<DomainParticipant>,
-    endpoints: Endpoints,
-    started_again: bool,
-) -> ProcessError {
-    let Some(participant) = participant else { return std::future::pending().await };
-    let mut forgotten = VecDeque::new();
-    let listener = participant.status_listener();
-    let mut events = listener.as_async_status_stream();
-    while let Some(event) = events.next().await {
-        match event {
-            DomainParticipantStatusEvent::RemoteReaderMatched { local_writer, remote_reader } => {
-                endpoints.matched(local_writer, remote_reader);
-            }
-            DomainParticipantStatusEvent::RemoteWriterMatched { local_reader, remote_writer }
-                if endpoints.is_of_requests(local_reader) =>
-            {
-                if let Err(e) = missed::ask(&participant, local_reader, remote_writer) {
-                    log::debug!("a client was not asked for its first request: {e}");
-                }
-            }
-            DomainParticipantStatusEvent::ReaderLost { guid, .. } => endpoints.lost(guid),
-            DomainParticipantStatusEvent::ParticipantLost { id, reason } => {
-                endpoints.lost_all(|reader| reader.prefix == id);
-                if matches!(reason, LostReason::Timeout { .. }) {
-                    forgotten.truncate(MOST_FORGOTTEN - 1);
-                    forgotten.push_front(id);
-                }
-            }
-            DomainParticipantStatusEvent::ParticipantDiscovered { dpd } if forgotten.contains(&dpd.guid.prefix) => {
-                forgotten.retain(|id| *id != dpd.guid.prefix);
-                let error = ProcessError::Estranged(format!("{:?}", dpd.guid.prefix));
-                if started_again {
-                    return error;
-                }
-                log::warn!("{error}");
-            }
-            DomainParticipantStatusEvent::RemoteReaderQosIncompatible {
-                local_writer: local,
-                requested_qos,
-                offered_qos,
-                ..
-            } => warn_of_incompatible(&endpoints, local, "subscription", &requested_qos, &offered_qos),
-            DomainParticipantStatusEvent::RemoteWriterQosIncompatible {
-                local_reader: local,
-                requested_qos,
-                offered_qos,
-                ..
-            } => warn_of_incompatible(&endpoints, local, "publisher", &requested_qos, &offered_qos),
-            _ => {}
-        }
-    }
-    // The participant is about to go.
-    std::future::pending().await
-}
-
-fn warn_of_incompatible(
-    endpoints: &Endpoints,
-    local: rustdds::GUID,
-    remote: &str,
-    requested: &rustdds::QosPolicies,
-    offered: &rustdds::QosPolicies,
-) {
-    if let Some(name) = endpoints.name(local) {
-        log::warn!(
-            "a {remote} on {name} does not match: requested {:?}, {:?}; offered {:?}, {:?}",
-            requested.reliability(),
-            requested.durability(),
-            offered.reliability(),
-            offered.durability()
-        );
-    }
 }
 
 /// Resolves when a thread of the middleware has ended.

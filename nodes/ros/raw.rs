@@ -15,7 +15,8 @@ use rustdds::no_key::{DataWriter, Decode, DefaultDecoder, DeserializerAdapter, S
 use rustdds::policy::{Durability, History, Reliability, ResourceLimits};
 use rustdds::{QosPolicies, QosPolicyBuilder, RTPSEntity, RepresentationIdentifier, Timestamp, TopicKind};
 
-use super::session::{Audience, Session, SessionError};
+use super::discovery::Audience;
+use super::session::{Session, SessionError};
 
 /// Length of the header: two bytes representation identifier, two bytes options.
 const HEADER_LEN: usize = 4;

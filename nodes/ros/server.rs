@@ -78,6 +78,7 @@ impl Session {
         let answers = topic(format!("rr{name}Reply"), response_type).map_err(fail)?;
         let requests = self
             .node
+            .borrow_mut()
             .create_subscription::<Req>(&requests, None)
             .map_err(|e| SessionError::middleware(format!("service {name}"), e))?;
         self.endpoints.opened_requests(requests.guid(), name);
@@ -175,7 +176,7 @@ impl<Req: DeserializeOwned + 'static, Resp: Serialize + 'static> Server<Req, Res
         match self.answers.async_write_with_options(answer, options.build()).await {
             // In the clear, so not where others must not read it.
             Ok(written) if content.len() > large::FRAGMENT.into() && !self.secured => {
-                large::send(&self.participant, written, SampleIdentity::from(request), &content);
+                large::send(&self.participant, written, SampleIdentity::from(request), content);
             }
             Ok(_) => {}
             Err(e) => {

@@ -21,6 +21,7 @@ use super::session::{Clock, Session, SessionError};
 pub(super) fn open(session: &mut Session) -> Result<(), SessionError> {
     let events = session
         .node
+        .borrow_mut()
         .create_publisher::<raw::ParameterEvent>(&session.context.get_parameter_events_topic(), None)
         .map_err(|e| SessionError::middleware("publisher of /parameter_events", e))?;
     let changes = Rc::new(Changes { events, health: Arc::clone(&session.health), clock: session.clock.clone() });

@@ -6,17 +6,18 @@
 use std::cell::RefCell;
 use std::collections::{HashMap, HashSet};
 use std::rc::Rc;
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::Arc;
 
 use futures::channel::{mpsc, oneshot};
 use futures::{SinkExt, StreamExt};
 use jigsaw_msgs::builtin_interfaces::msg::Time;
 use jigsaw_msgs::{Message, Service};
-use ros2_client::{Context, MessageInfo, MessageTypeName, Name, Node};
+use ros2_client::{Context, MessageInfo, MessageTypeName, Name, Node, QosProfile, Subscription};
 use rustdds::{GUID, RTPSEntity};
 
 use super::activity::Activity;
 use super::args::{ArgsError, NodeNames};
+use super::discovery::{Audience, Endpoints, LesserWriter, Offer};
 use super::health::Health;
 use super::params::Parameters;
 use super::topics::Topic;
@@ -68,79 +69,6 @@ pub struct Settings {
     pub activity: Activity,
 }
 
-/// What discovery has told of the endpoints of this process.
-#[derive(Debug, Clone, Default)]
-pub(super) struct Endpoints(Arc<Mutex<EndpointTable>>);
-
-#[derive(Debug, Default)]
-struct EndpointTable {
-    names: HashMap<GUID, String>,
-    requests: HashSet<GUID>,
-    readers_of: HashMap<GUID, HashSet<GUID>>,
-}
-
-impl Endpoints {
-    fn with<R>(&self, action: impl FnOnce(&mut EndpointTable) -> R) -> R {
-        action(&mut self.0.lock().unwrap_or_else(PoisonError::into_inner))
-    }
-
-    fn opened(&self, endpoint: GUID, name: &str) {
-        self.with(|table| table.names.insert(endpoint, name.to_owned()));
-    }
-
-    /// A reader of the requests to a service was opened.
-    pub(super) fn opened_requests(&self, endpoint: GUID, service: &str) {
-        self.opened(endpoint, service);
-        self.with(|table| table.requests.insert(endpoint));
-    }
-
-    /// Whether this reads the requests to a service.
-    pub(super) fn is_of_requests(&self, endpoint: GUID) -> bool {
-        self.with(|table| table.requests.contains(&endpoint))
-    }
-
-    pub(super) fn matched(&self, writer: GUID, reader: GUID) {
-        self.with(|table| table.readers_of.entry(writer).or_default().insert(reader));
-    }
-
-    pub(super) fn lost(&self, reader: GUID) {
-        self.with(|table| {
-            table.readers_of.values_mut().for_each(|readers| {
-                readers.remove(&reader);
-            });
-        });
-    }
-
-    /// All readers for which this holds are lost, as those of a participant that has died without a word.
-    pub(super) fn lost_all(&self, lost: impl Fn(&GUID) -> bool) {
-        self.with(|table| table.readers_of.values_mut().for_each(|readers| readers.retain(|reader| !lost(reader))));
-    }
-
-    /// The name of the topic of an endpoint of this process.
-    pub(super) fn name(&self, endpoint: GUID) -> Option<String> {
-        self.with(|table| table.names.get(&endpoint).cloned())
-    }
-}
-
-/// Tells whether anyone listens to a topic.
-#[derive(Debug, Clone)]
-pub struct Audience {
-    endpoints: Endpoints,
-    writer: GUID,
-}
-
-impl Audience {
-    /// The writer that is listened to.
-    pub fn writer(&self) -> GUID {
-        self.writer
-    }
-
-    /// How many subscriptions there are.
-    pub fn count(&self) -> usize {
-        self.endpoints.with(|table| table.readers_of.get(&self.writer).map_or(0, HashSet::len))
-    }
-}
-
 /// What time it is: that of the system, or the last of `/clock` under `use_sim_time`.
 #[derive(Debug, Clone, Default)]
 pub struct Clock {
@@ -174,7 +102,7 @@ impl Clock {
 /// An open node.
 pub struct Session {
     pub(super) context: Context,
-    pub(super) node: Node,
+    pub(super) node: Rc<RefCell<Node>>,
     pub(super) names: NodeNames,
     pub(super) executor: Rc<smol::LocalExecutor<'static>>,
     pub(super) endpoints: Endpoints,
@@ -225,27 +153,70 @@ impl Session {
         make: impl Fn(M, MessageInfo) -> T + 'static,
     ) -> Result<mpsc::Receiver<T>, SessionError> {
         let (name, dds_topic) = self.dds_topic(topic)?;
-        let subscription = self
-            .node
-            .create_subscription::<M>(&dds_topic, None)
-            .map_err(|e| SessionError::middleware(format!("subscription of {name}"), e))?;
-        self.endpoints.opened(subscription.guid(), &name);
-        let (mut sender, receiver) = mpsc::channel(CHANNEL_DEPTH);
-        let health = Arc::clone(&self.health);
+        let subscription = self.reader_opener().open::<M>(&name, &dds_topic, None)?;
+        let (sender, receiver) = mpsc::channel(CHANNEL_DEPTH);
+        self.spawn(hand_on(subscription, name, Arc::clone(&self.health), sender, move |message, info| {
+            Some(make(message, info))
+        }));
+        Ok(receiver)
+    }
+
+    /// As [`Self::subscribe`], and heard are those as well who offer less than the topic asks for.
+    ///
+    /// # Errors
+    /// As for [`Self::subscribe`].
+    pub fn subscribe_to_all<M: Message>(&mut self, topic: &Topic<M>) -> Result<mpsc::Receiver<M>, SessionError> {
+        self.subscribe_to_all_as(topic, |message, _| message)
+    }
+
+    /// As [`Self::subscribe_as`]. A publisher that offers less than the topic asks for is heard too: by a subscription that
+    /// asks for no more, opened when the first of its kind is met, which hears that kind alone.
+    pub(super) fn subscribe_to_all_as<M: Message, T: 'static>(
+        &mut self,
+        topic: &Topic<M>,
+        make: impl Fn(M, MessageInfo) -> T + Clone + 'static,
+    ) -> Result<mpsc::Receiver<T>, SessionError> {
+        let (name, dds_topic) = self.dds_topic(topic)?;
+        let opener = self.reader_opener();
+        let subscription = opener.open::<M>(&name, &dds_topic, None)?;
+        let mut met = self.endpoints.lesser_writers(subscription.guid());
+        let (sender, receiver) = mpsc::channel(CHANNEL_DEPTH);
+        let (qos, executor, health) = (topic.qos.clone(), Rc::clone(&self.executor), Arc::clone(&self.health));
+        let every = make.clone();
+        self.spawn(hand_on(subscription, name.clone(), Arc::clone(&health), sender.clone(), move |message, info| {
+            Some(every(message, info))
+        }));
         self.spawn(async move {
-            let mut messages = Box::pin(subscription.async_stream());
-            while let Some(message) = messages.next().await {
-                match message {
-                    Ok((message, info)) => {
-                        if sender.send(make(message, info)).await.is_err() {
-                            break;
-                        }
-                    }
-                    Err(e) => health.refuse("undecodable", &format!("message on {name} can't be decoded: {e}")),
+            let offers: Rc<RefCell<HashMap<GUID, Offer>>> = Rc::default();
+            let mut heard = HashSet::new();
+            while let Some(LesserWriter { writer, offer }) = met.next().await {
+                offers.borrow_mut().insert(writer, offer);
+                if !heard.insert(offer) {
+                    continue;
                 }
+                let subscription = match opener.open::<M>(&name, &dds_topic, Some(offer.at_most(qos.clone()))) {
+                    Ok(subscription) => subscription,
+                    Err(e) => {
+                        health.warn("subscription", &e.to_string());
+                        continue;
+                    }
+                };
+                log::info!("a publisher on {name} offers less than is asked for, and is heard all the same: {offer:?}");
+                let (offers, make) = (Rc::clone(&offers), make.clone());
+                let of_its_kind = move |message, info: MessageInfo| {
+                    // What offers more is heard by another subscription.
+                    let is_this = offers.borrow().get(&info.publisher_gid().into()) == Some(&offer);
+                    is_this.then(|| make(message, info))
+                };
+                let handing_on = hand_on(subscription, name.clone(), Arc::clone(&health), sender.clone(), of_its_kind);
+                executor.spawn(handing_on).detach();
             }
         });
         Ok(receiver)
+    }
+
+    fn reader_opener(&self) -> ReaderOpener {
+        ReaderOpener { node: Rc::clone(&self.node), endpoints: self.endpoints.clone() }
     }
 
     /// A sink to a topic, and who listens. A message that no reader takes in time is reported and dropped.
@@ -265,6 +236,7 @@ impl Session {
         let (name, dds_topic) = self.dds_topic(topic)?;
         let publisher = self
             .node
+            .borrow_mut()
             .create_publisher::<M>(&dds_topic, None)
             .map_err(|e| SessionError::middleware(format!("publisher of {name}"), e))?;
         let writer = publisher.guid();
@@ -280,13 +252,13 @@ impl Session {
                 }
             }
         });
-        Ok((sender, Audience { endpoints: self.endpoints.clone(), writer }))
+        Ok((sender, self.endpoints.audience(writer)))
     }
 
     /// Who listens to a writer that was opened beside the publishers of this session.
     pub(super) fn audience_of(&self, writer: GUID, name: &str) -> Audience {
         self.endpoints.opened(writer, name);
-        Audience { endpoints: self.endpoints.clone(), writer }
+        self.endpoints.audience(writer)
     }
 
     /// Gives the writers of a topic in other processes, as discovery knows them at the time of the call.
@@ -312,9 +284,57 @@ impl Session {
         let type_name = MessageTypeName::new(M::TYPE.package, M::TYPE.name);
         let dds_topic = self
             .node
+            .borrow()
             .create_topic(&dds_name(&name)?, type_name, &topic.qos)
             .map_err(|e| SessionError::middleware(format!("topic {name}"), e))?;
         Ok((name, dds_topic))
+    }
+}
+
+/// Opens subscriptions of a node, also while it runs.
+struct ReaderOpener {
+    node: Rc<RefCell<Node>>,
+    endpoints: Endpoints,
+}
+
+impl ReaderOpener {
+    /// A subscription, of the quality of service of its topic unless another one is given.
+    fn open<M: Message>(
+        &self,
+        name: &str,
+        topic: &rustdds::Topic,
+        qos: Option<QosProfile>,
+    ) -> Result<Subscription<M>, SessionError> {
+        let subscription = self
+            .node
+            .borrow_mut()
+            .create_subscription::<M>(topic, qos)
+            .map_err(|e| SessionError::middleware(format!("subscription of {name}"), e))?;
+        self.endpoints.opened(subscription.guid(), name);
+        Ok(subscription)
+    }
+}
+
+/// Hands what a subscription hears on to a channel, as long as someone takes it there.
+async fn hand_on<M: Message, T>(
+    subscription: Subscription<M>,
+    name: String,
+    health: Arc<Health>,
+    mut sender: mpsc::Sender<T>,
+    make: impl Fn(M, MessageInfo) -> Option<T>,
+) {
+    let mut messages = Box::pin(subscription.async_stream());
+    while let Some(message) = messages.next().await {
+        match message {
+            Ok((message, info)) => {
+                if let Some(made) = make(message, info)
+                    && sender.send(made).await.is_err()
+                {
+                    break;
+                }
+            }
+            Err(e) => health.refuse("undecodable", &format!("message on {name} can't be decoded: {e}")),
+        }
     }
 }
 

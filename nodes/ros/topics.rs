@@ -54,9 +54,6 @@ pub const IMAGE: Topic<Image> = Topic::new("image", CAMERA);
 pub const IMAGE_COMPRESSED: Topic<CompressedImage> =
     Topic::new("image/compressed", RELIABLE.history(History::KeepLast { depth: 1000 }));
 
-/// Frames of a compressed camera that sends best effort.
-pub const IMAGE_COMPRESSED_BEST_EFFORT: Topic<CompressedImage> = Topic::new("image/compressed", CAMERA);
-
 /// Pieces cut out of frames. Latched, so that a feature node that was restarted sees all of them.
 pub const PIECE_IMAGE: Topic<PieceImage> = Topic::new("pieces/image", LATCHED_PIECES);
 

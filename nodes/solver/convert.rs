@@ -43,6 +43,10 @@ const MAX_ISTHMUSES: usize = 1000;
 /// Share by which the length of the border in the message may differ from that of its points.
 const LENGTH_TOLERANCE: f64 = 0.05;
 
+/// By how much of its width the end of an isthmus may lie off the place on the border that is told: far more than borders
+/// sampled in another way differ by, far less than it is to any other isthmus.
+const PLACE_TOLERANCE: f64 = 0.25;
+
 /// Share by which the scales of two pieces may differ.
 const SCALE_TOLERANCE: f64 = 1e-6;
 
@@ -219,16 +223,17 @@ pub fn piece(message: &PieceFeatures) -> Result<(Piece, Sighting), FeaturesError
     let agrees = (told - length).abs() <= LENGTH_TOLERANCE * length;
     check("border_length_px", agrees, &told, &format!("{length:.1}, the length of the border"))?;
     check("isthmuses length", message.isthmuses.len() <= MAX_ISTHMUSES, &message.isthmuses.len(), &MAX_ISTHMUSES)?;
+    let border = Border { spacing: length / points.len() as f64, points };
     for isthmus in &message.isthmuses {
         check_isthmus(isthmus, told, &check)?;
+        check_place(isthmus, &border, &check)?;
     }
     check_skeleton(["endoskeleton", "endoskeleton points"], &message.endoskeleton, &check)?;
     check_skeleton(["exoskeleton", "exoskeleton points"], &message.exoskeleton, &check)?;
 
     let centroid_in_image = Point::from(moment / (3.0 * twice_area));
-    let spacing = length / points.len() as f64;
     let features = Features {
-        border: Border { points: points.clone(), spacing },
+        border: border.clone(),
         noise: message.noise_px.into(),
         isthmuses: message.isthmuses.iter().map(isthmus).collect(),
         // Matching needs no skeleton.
@@ -240,7 +245,7 @@ pub fn piece(message: &PieceFeatures) -> Result<(Piece, Sighting), FeaturesError
         stamp: message.header.stamp.clone(),
         table: PixelPlane::table(message.frame_width_px, message.frame_height_px, scale),
         centroid_in_image,
-        border_in_image: points,
+        border_in_image: border.points,
     };
     Ok((Piece { id: id.clone(), features }, sighting))
 }
@@ -275,6 +280,22 @@ fn check_isthmus(isthmus: &IsthmusMessage, border_length: f64, check: &Check<'_>
     check("isthmuses.idf_px length", idf.len() <= MAX_SAMPLES, &idf.len(), &MAX_SAMPLES)?;
     let bad = idf.iter().find(|d| !(0.0..=reach).contains(*d));
     check("isthmuses.idf_px", bad.is_none(), &bad.copied().unwrap_or_default(), &"0 to 65536")
+}
+
+/// Whether an isthmus lies where it says on the border: otherwise another part of the border would be matched.
+fn check_place(isthmus: &IsthmusMessage, border: &Border, check: &Check<'_>) -> Result<(), FeaturesError> {
+    let length = border.length();
+    let [first, last] = isthmus.arc_px.map(f64::from);
+    for (arc, point) in [first, last].into_iter().zip(&isthmus.critical_points_px) {
+        let distance = (border.point_at(arc) - Point::new(point.x.into(), point.y.into())).norm();
+        let near = distance <= PLACE_TOLERANCE * f64::from(isthmus.width_px);
+        let rule = format!("where the critical point ({}, {}) lies on the border", point.x, point.y);
+        check("isthmuses.arc_px", near, &arc, &rule)?;
+    }
+    let path = (last - first).rem_euclid(length);
+    let agrees = (path - f64::from(isthmus.path_length_px)).abs() <= LENGTH_TOLERANCE * length;
+    let rule = format!("{path:.1}, the length of the border from the first critical point to the second");
+    check("isthmuses.path_length_px", agrees, &isthmus.path_length_px, &rule)
 }
 
 /// Matching needs no skeleton, but whoever records or draws the message relies on it.

@@ -65,12 +65,12 @@ class Camera:
     """Publishes each frame with a stamp of its own until the cell has told of it, as best effort may lose one;
     compressed frames, which are reliable, once."""
 
-    def __init__(self, ros, topic="image", compressed=False, features="pieces/features"):
+    def __init__(self, ros, topic="image", compressed=False, features="pieces/features", offered=RELIABLE):
         self.ros = ros
         self.node = ros.node("camera")
-        self.compressed = compressed
+        self.sent_once = compressed and offered != BEST_EFFORT
         if compressed:
-            self.publisher = self.node.create_publisher(CompressedImage, topic, RELIABLE)
+            self.publisher = self.node.create_publisher(CompressedImage, topic, offered)
         else:
             self.publisher = self.node.create_publisher(Image, topic, BEST_EFFORT)
         self.features = {}  # by the stamp's seconds
@@ -80,18 +80,15 @@ class Camera:
         self.features.setdefault(features.header.stamp.sec, []).append(features)
 
     def listened_to(self):
-        """Waits until the capture node listens: to compressed frames with two subscriptions, one of them reliable."""
-        wanted = 2 if self.compressed else 1
-        self.ros.until(
-            lambda: self.publisher.get_subscription_count() >= wanted, f"listener on {self.publisher.topic_name}"
-        )
+        """Waits until the capture node listens."""
+        self.ros.until(lambda: self.publisher.get_subscription_count() > 0, f"listener on {self.publisher.topic_name}")
 
     def show(self, message, seen=None):
         """Publishes until the features of the frame come back (or `seen` gives something true); gives them."""
         second = message.header.stamp.sec
         seen = seen or (lambda: self.features.get(second))
         self.listened_to()
-        period = math.inf if self.compressed else AGAIN
+        period = math.inf if self.sent_once else AGAIN
         return self.ros.until_repeated(lambda: self.publisher.publish(message), seen, f"sign of frame {second}", period)
 
     def show_puzzle(self, puzzle, make=image_message, arm=None, first_second=1, **options):

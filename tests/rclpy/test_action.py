@@ -65,7 +65,8 @@ def test_a_goal_is_reached_with_feedback_on_the_way(launcher, ros, generate, cli
     assert len(client.feedback[-1].best.pieces) == 6 and client.feedback[-1].matings >= 5
 
     # Whoever asks again, or later, gets the same; the next goal is reached at once.
-    assert client.end(handle)[1] == result
+    # Often: an answer that comes in two ways at once is rarely put together wrongly.
+    assert all(client.end(handle)[1] == result for _ in range(200))
     again = client.send(expected_pieces=6)
     assert again.accepted and client.end(again)[0] == GoalStatus.STATUS_SUCCEEDED
 

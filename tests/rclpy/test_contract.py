@@ -4,15 +4,17 @@ coordinate frames, and what each parameter does when it is set while the cell ru
 import numpy
 import pytest
 from builtin_interfaces.msg import Time
-from jigsaw_msgs.msg import Assembly, PieceImage
+from jigsaw_msgs.msg import Assembly, PieceFeatures, PieceImage
 from PIL import Image as Picture
 from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
 from rcl_interfaces.srv import SetParameters
+from rclpy.qos import QoSProfile
 from sensor_msgs.msg import Image
 from std_srvs.srv import Trigger
 
 from bench import (
     AGAIN,
+    BEST_EFFORT,
     LATCHED_PIECES,
     RELIABLE,
     SCALE,
@@ -89,6 +91,49 @@ def test_pieces_of_one_frame_are_numbered_in_reading_order_and_shown_again_on_de
     assert answer.success, answer.message
     ros.until(lambda: len(images) >= before + 4, "images of all pieces once more")
     assert sorted(image.id for image in images[before : before + 4]) == names
+
+
+@pytest.mark.parametrize(
+    "offered", [LATCHED_PIECES, QoSProfile(depth=10), BEST_EFFORT], ids=["latched", "volatile", "effort"]
+)
+def test_publishers_of_pieces_are_heard_whatever_they_offer(launcher, ros, generate, offered):
+    launcher.start("capture_node", "--ros-args", *SCALE)
+    launcher.start("feature_node")
+    images = ros.latest(ros.node("keeps_images"), PieceImage, "pieces/image", LATCHED_PIECES)
+    camera = Camera(ros)
+    truth = camera.show_puzzle(generate(2, 3, 5))
+    ros.until(lambda: len(images) == len(truth), "images of all pieces")
+
+    # Nodes of the cell between nodes of others.
+    launcher.start("feature_node", "--ros-args", "-r", "__ns:=/a")
+    launcher.start("solver_node", "--ros-args", "-r", "__ns:=/b")
+    stranger, arm = ros.node("stranger"), Arm(ros, "/b/assembly")
+    to_features = stranger.create_publisher(PieceImage, "/a/pieces/image", offered)
+    to_solver = stranger.create_publisher(PieceFeatures, "/b/pieces/features", offered)
+    features = ros.latest(stranger, PieceFeatures, "/a/pieces/features", LATCHED_PIECES)
+    ros.until(lambda: to_features.get_subscription_count() and to_solver.get_subscription_count(), "listeners")
+    ros.until_repeated(
+        lambda: [to_features.publish(image) for image in images],
+        lambda: {one.id for one in features} == set(truth),
+        "features of all pieces",
+        AGAIN,
+    )
+    ros.until_repeated(
+        lambda: [to_solver.publish(one) for [one] in camera.features.values()],
+        lambda: arm.assemblies and arm.assemblies[-1].state == Assembly.COMPLETE,
+        "complete assembly",
+        AGAIN,
+    )
+    check_assembly(arm, truth, arm.complete(len(truth)))
+
+
+@pytest.mark.parametrize("offered", [LATCHED_PIECES, RELIABLE, BEST_EFFORT], ids=["latched", "reliable", "effort"])
+def test_compressed_cameras_are_heard_whatever_they_offer(launcher, ros, generate, offered):
+    launcher.start("capture_node")
+    launcher.start("feature_node")
+    camera = Camera(ros, "image/compressed", compressed=True, offered=offered)
+    [features] = camera.show(compressed_message(grey(generate(2, 3, 5).frames[0]), Time(sec=1)))
+    assert features.source == "/image/compressed"
 
 
 def test_names_of_coordinate_frames_and_jpeg(launcher, ros, generate):

@@ -1,0 +1,225 @@
+//! What discovery tells of the endpoints of this process: who listens, who asks for or offers too little, and who comes
+//! back after it was forgotten.
+
+use std::collections::{HashMap, HashSet, VecDeque};
+use std::sync::{Arc, Mutex, PoisonError};
+
+use futures::StreamExt;
+use futures::channel::mpsc;
+use ros2_client::QosProfile;
+use rustdds::dds::statusevents::{DomainParticipantStatusEvent, LostReason, StatusEvented};
+use rustdds::policy::{Durability, Reliability};
+use rustdds::{DomainParticipant, GUID, QosPolicies};
+
+use super::missed;
+
+/// Most participants that are remembered as forgotten; beyond, those that have been away longest are not expected back.
+const MOST_FORGOTTEN: usize = 1024;
+
+/// One that was forgotten has come back.
+#[derive(Debug, thiserror::Error)]
+#[error(
+    "participant {0} was away for longer than its lease and has come back, and the middleware can't find its topics again; start this node again"
+)]
+pub struct Estranged(String);
+
+/// What discovery has told of the endpoints of this process.
+#[derive(Debug, Clone, Default)]
+pub(super) struct Endpoints(Arc<Mutex<EndpointTable>>);
+
+#[derive(Debug, Default)]
+struct EndpointTable {
+    names: HashMap<GUID, String>,
+    requests: HashSet<GUID>,
+    readers_of: HashMap<GUID, HashSet<GUID>>,
+    lesser_writers: HashMap<GUID, mpsc::UnboundedSender<LesserWriter>>,
+}
+
+/// A writer that offers less than a reader asks for.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct LesserWriter {
+    pub(super) writer: GUID,
+    pub(super) offer: Offer,
+}
+
+/// What a writer offers of what can keep it apart from a reader.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub(super) struct Offer {
+    reliable: bool,
+    latched: bool,
+}
+
+impl Offer {
+    fn of(qos: &QosPolicies) -> Self {
+        Self {
+            // What goes without saying is the default of a writer.
+            reliable: qos.reliability() != Some(Reliability::BestEffort),
+            latched: qos.durability().is_some_and(|durability| durability >= Durability::TransientLocal),
+        }
+    }
+
+    /// The quality of service of a reader that asks for no more than this.
+    pub(super) fn at_most(self, asked: QosProfile) -> QosProfile {
+        let asked = if self.reliable { asked } else { asked.reliability_best_effort() };
+        if self.latched { asked } else { asked.durability(ros2_client::qos::Durability::Volatile) }
+    }
+}
+
+impl Endpoints {
+    fn with<R>(&self, action: impl FnOnce(&mut EndpointTable) -> R) -> R {
+        action(&mut self.0.lock().unwrap_or_else(PoisonError::into_inner))
+    }
+
+    /// A reader or writer of this topic was opened.
+    pub(super) fn opened(&self, endpoint: GUID, name: &str) {
+        self.with(|table| table.names.insert(endpoint, name.to_owned()));
+    }
+
+    /// A reader of the requests to a service was opened.
+    pub(super) fn opened_requests(&self, endpoint: GUID, service: &str) {
+        self.opened(endpoint, service);
+        self.with(|table| table.requests.insert(endpoint));
+    }
+
+    /// Whether this reads the requests to a service.
+    fn is_of_requests(&self, endpoint: GUID) -> bool {
+        self.with(|table| table.requests.contains(&endpoint))
+    }
+
+    fn matched(&self, writer: GUID, reader: GUID) {
+        self.with(|table| table.readers_of.entry(writer).or_default().insert(reader));
+    }
+
+    fn lost(&self, reader: GUID) {
+        self.with(|table| {
+            table.readers_of.values_mut().for_each(|readers| {
+                readers.remove(&reader);
+            });
+        });
+    }
+
+    /// All readers for which this holds are lost, as those of a participant that has died without a word.
+    fn lost_all(&self, lost: impl Fn(&GUID) -> bool) {
+        self.with(|table| table.readers_of.values_mut().for_each(|readers| readers.retain(|reader| !lost(reader))));
+    }
+
+    /// Tells a reader of a writer that offers less than it asks for. False if that is none of its concern.
+    fn tell_of_lesser(&self, reader: GUID, writer: GUID, offered: &QosPolicies) -> bool {
+        let met = LesserWriter { writer, offer: Offer::of(offered) };
+        self.with(|table| table.lesser_writers.get(&reader).is_some_and(|told| told.unbounded_send(met).is_ok()))
+    }
+
+    /// The writers that offer less than a reader asks for, as they are met.
+    pub(super) fn lesser_writers(&self, reader: GUID) -> mpsc::UnboundedReceiver<LesserWriter> {
+        let (sender, receiver) = mpsc::unbounded();
+        self.with(|table| table.lesser_writers.insert(reader, sender));
+        receiver
+    }
+
+    /// Who listens to a writer.
+    pub(super) fn audience(&self, writer: GUID) -> Audience {
+        Audience { endpoints: self.clone(), writer }
+    }
+
+    /// The name of the topic of an endpoint of this process.
+    fn name(&self, endpoint: GUID) -> Option<String> {
+        self.with(|table| table.names.get(&endpoint).cloned())
+    }
+}
+
+/// Tells whether anyone listens to a topic.
+#[derive(Debug, Clone)]
+pub struct Audience {
+    endpoints: Endpoints,
+    writer: GUID,
+}
+
+impl Audience {
+    /// The writer that is listened to.
+    pub fn writer(&self) -> GUID {
+        self.writer
+    }
+
+    /// How many subscriptions there are.
+    pub fn count(&self) -> usize {
+        self.endpoints.with(|table| table.readers_of.get(&self.writer).map_or(0, HashSet::len))
+    }
+}
+
+/// Keeps account of who listens, and warns of those who would but can't. Resolves when one that was forgotten comes back,
+/// if this process is started again then; otherwise that is a warning, too.
+pub(super) async fn follow(
+    participant: Option<DomainParticipant>,
+    endpoints: Endpoints,
+    started_again: bool,
+) -> Estranged {
+    let Some(participant) = participant else { return std::future::pending().await };
+    let mut forgotten = VecDeque::new();
+    let listener = participant.status_listener();
+    let mut events = listener.as_async_status_stream();
+    while let Some(event) = events.next().await {
+        match event {
+            DomainParticipantStatusEvent::RemoteReaderMatched { local_writer, remote_reader } => {
+                endpoints.matched(local_writer, remote_reader);
+            }
+            DomainParticipantStatusEvent::RemoteWriterMatched { local_reader, remote_writer }
+                if endpoints.is_of_requests(local_reader) =>
+            {
+                if let Err(e) = missed::ask(&participant, local_reader, remote_writer) {
+                    log::debug!("a client was not asked for its first request: {e}");
+                }
+            }
+            DomainParticipantStatusEvent::ReaderLost { guid, .. } => endpoints.lost(guid),
+            DomainParticipantStatusEvent::ParticipantLost { id, reason } => {
+                endpoints.lost_all(|reader| reader.prefix == id);
+                if matches!(reason, LostReason::Timeout { .. }) {
+                    forgotten.truncate(MOST_FORGOTTEN - 1);
+                    forgotten.push_front(id);
+                }
+            }
+            DomainParticipantStatusEvent::ParticipantDiscovered { dpd } if forgotten.contains(&dpd.guid.prefix) => {
+                forgotten.retain(|id| *id != dpd.guid.prefix);
+                let error = Estranged(format!("{:?}", dpd.guid.prefix));
+                if started_again {
+                    return error;
+                }
+                log::warn!("{error}");
+            }
+            DomainParticipantStatusEvent::RemoteReaderQosIncompatible {
+                local_writer: local,
+                requested_qos,
+                offered_qos,
+                ..
+            } => warn_of_incompatible(&endpoints, local, "subscription", &requested_qos, &offered_qos),
+            DomainParticipantStatusEvent::RemoteWriterQosIncompatible {
+                local_reader: local,
+                remote_writer,
+                requested_qos,
+                offered_qos,
+            } if !endpoints.tell_of_lesser(local, remote_writer, &offered_qos) => {
+                warn_of_incompatible(&endpoints, local, "publisher", &requested_qos, &offered_qos);
+            }
+            _ => {}
+        }
+    }
+    // The participant is about to go.
+    std::future::pending().await
+}
+
+fn warn_of_incompatible(
+    endpoints: &Endpoints,
+    local: GUID,
+    remote: &str,
+    requested: &QosPolicies,
+    offered: &QosPolicies,
+) {
+    if let Some(name) = endpoints.name(local) {
+        log::warn!(
+            "a {remote} on {name} does not match: requested {:?}, {:?}; offered {:?}, {:?}",
+            requested.reliability(),
+            requested.durability(),
+            offered.reliability(),
+            offered.durability()
+        );
+    }
+}
