@@ -9,8 +9,8 @@ mod domain;
 use std::fs::File;
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, ExitStatus, Stdio};
-use std::sync::atomic::{AtomicBool, Ordering};
-use std::time::Duration;
+use std::sync::mpsc;
+use std::time::{Duration, Instant};
 
 use jigsaw::generate::{Options, Puzzle};
 use jigsaw_msgs::Message;
@@ -19,10 +19,16 @@ use jigsaw_nodes::ros::topics::{self, Topic};
 use ros2_client::{Context, MessageTypeName, Name, NodeName, NodeOptions};
 
 /// How long the secured cell may take; key exchange between all processes takes seconds.
-const PATIENCE: &str = "90";
+const PATIENCE: Duration = Duration::from_secs(90);
 
 /// How long one listens that is to hear nothing: several times what an authorised one takes to hear the first thing.
-const SILENCE: &str = "10";
+const SILENCE: Duration = Duration::from_secs(10);
+
+/// How much longer than it listens a process may take to start and to end.
+const MARGIN: Duration = Duration::from_secs(60);
+
+/// How often is looked whether a process has ended.
+const LOOK: Duration = Duration::from_millis(20);
 
 /// Pieces of the puzzle: two rows, three columns.
 const PIECES: usize = 6;
@@ -68,12 +74,12 @@ impl Cell {
     }
 
     /// Listens for the assembly; whether it came complete, where it was written, and what was said.
-    fn watch(&self, enclave: Option<&str>, patience: &str, pieces: usize) -> (ExitStatus, PathBuf, String) {
+    fn watch(&self, enclave: Option<&str>, patience: Duration, pieces: usize) -> (ExitStatus, PathBuf, String) {
         let out = self.path(&format!("seen_{}", enclave.unwrap_or("none").trim_matches('/')));
-        let pieces = pieces.to_string();
-        let args = ["watch", "--timeout", patience, "--pieces", &pieces, "--out", out.to_str().unwrap()];
+        let (pieces, seconds) = (pieces.to_string(), patience.as_secs().to_string());
+        let args = ["watch", "--timeout", &seconds, "--pieces", &pieces, "--out", out.to_str().unwrap()];
         let mut watcher = self.start(env!("CARGO_BIN_EXE_jigsaw"), enclave, &args);
-        let status = watcher.child.wait().unwrap();
+        let status = watcher.wait(patience + MARGIN);
         (status, out, watcher.said())
     }
 }
@@ -84,6 +90,18 @@ struct Process {
 }
 
 impl Process {
+    /// Waits for its end, which has to come in this time.
+    fn wait(&mut self, patience: Duration) -> ExitStatus {
+        let end = Instant::now() + patience;
+        loop {
+            match self.child.try_wait().unwrap() {
+                Some(status) => return status,
+                None if Instant::now() < end => std::thread::sleep(LOOK),
+                None => panic!("{} has not ended after {patience:?}: {}", self.log.display(), self.said()),
+            }
+        }
+    }
+
     fn said(&self) -> String {
         std::fs::read_to_string(&self.log).unwrap()
     }
@@ -98,30 +116,31 @@ impl Drop for Process {
 
 /// Publishes a message again and again, without a certificate, while something else is done.
 fn injecting<M: Message, T>(domain: u16, topic: &Topic<M>, message: M, action: impl FnOnce() -> T) -> T {
-    let participant = rustdds::DomainParticipantBuilder::new(domain)
-        .with_only_networks([std::net::IpAddr::from([127, 0, 0, 1])])
-        .build()
-        .unwrap();
-    let context = Context::from_domain_participant(participant).unwrap();
-    let options = NodeOptions::new().enable_rosout(false);
-    let mut node = context.new_node(NodeName::new("/", "stranger").unwrap(), options).unwrap();
-    let name = Name::parse(&format!("/{}", topic.name)).unwrap();
-    let kind = MessageTypeName::new(M::TYPE.package, M::TYPE.name);
-    let dds_topic = node.create_topic(&name, kind, &topic.qos).unwrap();
-    let publisher = node.create_publisher::<M>(&dds_topic, None).unwrap();
-    let done = AtomicBool::new(false);
-    std::thread::scope(|scope| {
-        scope.spawn(|| {
-            while !done.load(Ordering::Relaxed) {
-                let _ = publisher.publish(message.clone());
-                // A publisher of ten messages a second; nothing is waited for.
-                std::thread::sleep(Duration::from_millis(100));
-            }
-        });
-        let result = action();
-        done.store(true, Ordering::Relaxed);
-        result
-    })
+    let (name, qos) = (Name::parse(&format!("/{}", topic.name)).unwrap(), topic.qos.clone());
+    let (publishes, begun) = mpsc::channel();
+    let (done, going_on) = mpsc::channel::<()>();
+    std::thread::spawn(move || {
+        let participant = rustdds::DomainParticipantBuilder::new(domain)
+            .with_only_networks([std::net::IpAddr::from([127, 0, 0, 1])])
+            .build()
+            .unwrap();
+        let context = Context::from_domain_participant(participant).unwrap();
+        let options = NodeOptions::new().enable_rosout(false);
+        let mut node = context.new_node(NodeName::new("/", "stranger").unwrap(), options).unwrap();
+        let kind = MessageTypeName::new(M::TYPE.package, M::TYPE.name);
+        let dds_topic = node.create_topic(&name, kind, &qos).unwrap();
+        let publisher = node.create_publisher::<M>(&dds_topic, None).unwrap();
+        publishes.send(()).unwrap();
+        // A publisher of ten messages a second.
+        while going_on.recv_timeout(Duration::from_millis(100)) == Err(mpsc::RecvTimeoutError::Timeout) {
+            let _ = publisher.publish(message.clone());
+        }
+    });
+    begun.recv_timeout(MARGIN).expect("the stranger publishes");
+    let result = action();
+    // It takes its leave while the test goes on.
+    drop(done);
+    result
 }
 
 #[test]
@@ -173,7 +192,7 @@ fn the_cell_talks_among_itself_alone() {
 fn without_its_files_a_node_does_not_start() {
     let cell = Cell::new();
     let mut node = cell.start(env!("CARGO_BIN_EXE_solver_node"), Some("/nobody"), &[]);
-    assert_eq!(node.child.wait().unwrap().code(), Some(2));
+    assert_eq!(node.wait(MARGIN).code(), Some(2));
     let said = node.said();
     assert!(said.contains("nobody") && said.lines().count() == 1, "{said}");
 }

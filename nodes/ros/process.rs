@@ -10,7 +10,9 @@
 //! **Signals** are blocked on every thread, and one thread waits for them. A handler that ran on one of RustDDS's own
 //! threads would interrupt its poll, after which that thread ends for good and the node lives on deaf. SIGSTOP and
 //! SIGCONT interrupt polls all the same; so a **watchdog** looks whether RustDDS's threads still live and ends the
-//! process where one has gone, so that whoever started it starts it again.
+//! process where one has gone, so that whoever started it starts it again. Another one does the same where the process's own loop
+//! stands still, in a call of the middleware that does not return; and an end waits for the middleware's threads with
+//! a limit.
 //!
 //! **Whoever was forgotten and comes back** (a link was down for longer than the lease, 50 s) stays a stranger: RustDDS
 //! has taken its announcements of endpoints once and takes them for known when they come again. A node that sees that ends
@@ -21,7 +23,9 @@ use std::net::{IpAddr, Ipv4Addr};
 use std::path::Path;
 use std::process::ExitCode;
 use std::rc::Rc;
-use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::mpsc::{self, RecvTimeoutError};
+use std::sync::{Arc, Mutex, PoisonError, Weak};
 use std::time::Duration;
 
 use futures::channel::oneshot;
@@ -103,12 +107,20 @@ pub const COMMON_PARAMETERS: &[Spec] = &[AUTOSTART, USE_SIM_TIME, NETWORK_INTERF
 /// How often the watchdog looks.
 const WATCH_PERIOD: Duration = Duration::from_millis(500);
 
+/// How many looks of the watchdog the process's loop may stand still: long beyond any work that is done in it, opening
+/// the middleware on a busy machine included. Looks and not seconds, so that a process that was stopped is not taken
+/// for one that hangs.
+const LOOKS: u32 = 60;
+
 /// How often a node reports.
 const REPORT_PERIOD: Duration = Duration::from_secs(1);
 
 /// How long an ordered end may take after a signal; then the process ends anyway, so that whoever sent the signal
 /// need not kill it.
 const END_PATIENCE: Duration = Duration::from_millis(800);
+
+/// How long the middleware may take to end; what it has not done by then is left to the end of the process.
+const MIDDLEWARE_PATIENCE: Duration = Duration::from_secs(5);
 
 /// Beginning of the names of RustDDS's threads.
 const MIDDLEWARE_THREADS: &str = "RustDDS";
@@ -140,6 +152,9 @@ pub enum ProcessError {
     /// A thread of the middleware has ended.
     #[error("the middleware has gone deaf (its thread '{0}' ended, as it does after SIGSTOP); start this node again")]
     Deaf(String),
+    /// A call does not return.
+    #[error("the node's loop has stood still for {} s; start this node again", (WATCH_PERIOD * LOOKS).as_secs())]
+    Stalled,
     /// One that was forgotten has come back.
     #[error(transparent)]
     Estranged(#[from] Estranged),
@@ -151,7 +166,7 @@ impl ProcessError {
         match self {
             Self::Args(_) | Self::Parameter(_) | Self::Configuration(_) | Self::Session(SessionError::Name(_)) => 2,
             Self::Session(_) | Self::System { .. } => 1,
-            Self::Deaf(_) | Self::Estranged(_) => 3,
+            Self::Deaf(_) | Self::Stalled | Self::Estranged(_) => 3,
         }
     }
 }
@@ -192,11 +207,14 @@ pub fn main(program: Program, open: impl FnOnce(Session) -> Result<Work, Process
 pub fn exit_code(program: &str, result: Result<(), ProcessError>) -> ExitCode {
     match result {
         Ok(()) => ExitCode::SUCCESS,
-        Err(error) => {
-            eprintln!("{program}: {error}");
-            ExitCode::from(error.exit_code())
-        }
+        Err(error) => say(program, &error).into(),
     }
+}
+
+/// Says what went wrong, and gives the exit code for it.
+fn say(program: &str, error: &ProcessError) -> u8 {
+    eprintln!("{program}: {error}");
+    error.exit_code()
 }
 
 fn help(program: &Program) -> String {
@@ -234,7 +252,7 @@ pub struct Process {
     /// Said at the end.
     farewell: Option<Farewell>,
     /// Where the work is told that a signal has come, if it wants to end itself.
-    ending: Option<oneshot::Sender<()>>,
+    ending: Arc<Mutex<Option<oneshot::Sender<()>>>>,
     /// The parameters of all nodes of a composed process: one that another node has is no mistake.
     tables: &'static [&'static [Spec]],
     /// Whether it is started again where it ends by a fault.
@@ -260,7 +278,7 @@ impl Process {
             participant: None,
             turn: None,
             farewell: None,
-            ending: None,
+            ending: Arc::default(),
             tables: &[],
             started_again: false,
         })
@@ -335,7 +353,7 @@ impl Process {
     /// not drop it, and the process waits for it; a second one ends the process as the first one does otherwise.
     pub fn ending(&mut self) -> impl Future<Output = ()> + use<> {
         let (sender, told) = oneshot::channel();
-        self.ending = Some(sender);
+        *self.ending.lock().unwrap_or_else(PoisonError::into_inner) = Some(sender);
         told.map(drop)
     }
 
@@ -344,26 +362,10 @@ impl Process {
     /// # Errors
     /// What went wrong while opening or running.
     pub fn run(mut self, open: impl FnOnce(&mut Self) -> Result<Work, ProcessError>) -> Result<(), ProcessError> {
+        let signalled = self.take_signals()?;
+        let rounds = Arc::new(AtomicU64::new(0));
+        self.end_when_stalled(Arc::downgrade(&rounds))?;
         let work = open(&mut self)?;
-        let (signal, signalled) = oneshot::channel();
-        let ending = self.ending.take();
-        std::thread::Builder::new()
-            .name("signals".to_owned())
-            .spawn(move || {
-                if let Some(ending) = ending
-                    && let Ok(received) = signals().wait()
-                {
-                    log::info!("{received}: ending");
-                    let _ = ending.send(());
-                }
-                if let Ok(received) = signals().wait() {
-                    log::info!("{received}: ending");
-                    let _ = signal.send(());
-                    std::thread::sleep(END_PATIENCE);
-                    std::process::exit(0);
-                }
-            })
-            .map_err(|e| ProcessError::System { what: "starting a thread", reason: e.to_string() })?;
         let participant = self.participant.as_ref().map(|(participant, _)| participant.clone());
         let discovery = discovery::follow(participant, self.endpoints.clone(), self.started_again);
         if let Some(turn) = self.turn.take() {
@@ -375,7 +377,7 @@ impl Process {
             futures::select! {
                 result = work.fuse() => result,
                 _ = signalled.fuse() => Ok(()),
-                error = watchdog().fuse() => Err(error),
+                error = watchdog(&rounds).fuse() => Err(error),
                 estranged = Box::pin(discovery).fuse() => Err(estranged.into()),
             }
         }));
@@ -390,14 +392,53 @@ impl Process {
             // A dead participant can't be taken down in order; its drop would wait for the dead thread.
             leave();
             if let Err(error) = &result {
-                eprintln!("{}: {error}", self.name);
-                std::process::exit(i32::from(error.exit_code()));
+                std::process::exit(say(self.name, error).into());
             }
         }
         // When nothing of it is left that could announce itself once more.
+        let participant = self.participant.take();
         drop((executor, self));
+        take_down(participant);
         leave();
         result
+    }
+
+    /// Waits for signals, on a thread of its own. What it gives resolves when the process is to end; soon after that it
+    /// ends in any case.
+    fn take_signals(&self) -> Result<oneshot::Receiver<()>, ProcessError> {
+        let (signal, signalled) = oneshot::channel();
+        let ending = Arc::clone(&self.ending);
+        start_thread("signals", move || {
+            while let Ok(received) = signals().wait() {
+                log::info!("{received}: ending");
+                let told = ending.lock().unwrap_or_else(PoisonError::into_inner).take();
+                if told.is_none_or(|ending| ending.send(()).is_err()) {
+                    break;
+                }
+            }
+            let _ = signal.send(());
+            std::thread::sleep(END_PATIENCE);
+            std::process::exit(0);
+        })?;
+        Ok(signalled)
+    }
+
+    /// Ends the process where its loop, whose rounds are counted, stands still.
+    fn end_when_stalled(&self, rounds: Weak<AtomicU64>) -> Result<(), ProcessError> {
+        let name = self.name;
+        start_thread("watchdog", move || {
+            let (mut last, mut looks) = (0, 0);
+            while let Some(rounds) = rounds.upgrade() {
+                let now = rounds.load(Ordering::Relaxed);
+                looks = if now == last { looks + 1 } else { 0 };
+                last = now;
+                if looks > LOOKS {
+                    std::process::exit(say(name, &ProcessError::Stalled).into());
+                }
+                drop(rounds);
+                std::thread::sleep(WATCH_PERIOD);
+            }
+        })
     }
 
     /// The DDS participant, which all nodes of the process share; opened with the parameters of the first of them.
@@ -564,11 +605,26 @@ fn report(session: &mut Session) -> Result<(), SessionError> {
     Ok(())
 }
 
-/// Resolves when a thread of the middleware has ended.
-async fn watchdog() -> ProcessError {
+fn start_thread(name: &str, work: impl FnOnce() + Send + 'static) -> Result<(), ProcessError> {
+    let started = std::thread::Builder::new().name(name.to_owned()).spawn(work);
+    started.map(drop).map_err(|e| ProcessError::System { what: "starting a thread", reason: e.to_string() })
+}
+
+/// Drops the participant and so ends its threads; waits for them, but not without limit.
+fn take_down(participant: Option<(DomainParticipant, Context)>) {
+    let (gone, ended) = mpsc::channel::<()>();
+    let dropping = start_thread("take down", move || drop((participant, gone)));
+    if dropping.is_ok() && ended.recv_timeout(MIDDLEWARE_PATIENCE) == Err(RecvTimeoutError::Timeout) {
+        log::warn!("the middleware has not ended after {} s and is left to itself", MIDDLEWARE_PATIENCE.as_secs());
+    }
+}
+
+/// Counts the rounds of the process's loop; resolves when a thread of the middleware has ended.
+async fn watchdog(rounds: &AtomicU64) -> ProcessError {
     let mut known = middleware_threads();
     loop {
         smol::Timer::after(WATCH_PERIOD).await;
+        rounds.fetch_add(1, Ordering::Relaxed);
         let alive = middleware_threads();
         if let Some((_, name)) = known.iter().find(|thread| !alive.contains(thread)) {
             return ProcessError::Deaf(name.clone());
