@@ -1,8 +1,15 @@
 //! Where a row of pixels goes over from one class to the other.
 
+use crate::wide::widely;
+
 /// Tells where in a row of pixels `set` begins to hold (`true`) and where it ceases to (`false`), from left to right; before the row
 /// it does not hold.
-pub(crate) fn changes<P: Copy>(row: &[P], set: impl Fn(P) -> bool, mut change: impl FnMut(usize, bool)) {
+pub(crate) fn changes<P: Copy>(row: &[P], set: impl Fn(P) -> bool, change: impl FnMut(usize, bool)) {
+    widely!(tell_changes(row, set, change));
+}
+
+#[inline(always)]
+fn tell_changes<P: Copy>(row: &[P], set: impl Fn(P) -> bool, mut change: impl FnMut(usize, bool)) {
     /// Pixels that are looked at together, as bits of a number; most chunks are uniform.
     const CHUNK: usize = 32;
     let mut holds = false;

@@ -442,8 +442,7 @@ impl Tracer {
             let contour = self.contours.longest.iter().map(|p| second.own(first.in_full(*p)));
             self.band.mark(contour, [second.width, second.height]);
             let sigma = (late * late - second.variance()).sqrt() / second.step;
-            let is_shape = |value: f32| sense * (value - level) > 0.0;
-            self.band.blur(second, sigma, cutout.ground_level, is_shape, &mut self.starts);
+            self.band.blur(second, sigma, cutout.ground_level, (level, sense), &mut self.starts);
             let picture = Blurred { band: &self.band, raw: second };
             let aliasing = aliasing(optical / second.step, sigma);
             if !self.contours.trace(&Raster { picture, level, contrast, sense, aliasing }, &self.starts) {

@@ -20,6 +20,7 @@ pub mod isthmus;
 pub mod mask;
 pub mod profile;
 pub mod skeleton;
+mod wide;
 
 use crate::skeleton::Polarity;
 

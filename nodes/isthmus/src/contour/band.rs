@@ -6,6 +6,7 @@
 use super::iso::{Picture, Start};
 use crate::Point;
 use crate::changes::changes;
+use crate::wide::widely;
 use std::ops::Range;
 
 /// The pixels as they are, of the full picture or of one of less resolution.
@@ -78,29 +79,30 @@ impl Raw<'_> {
 
     /// The picture at half the resolution: means of 2 x 2 pixels; of an odd side the last pixel counts twice.
     pub(super) fn halved<'a>(&self, halved: &'a mut Vec<u8>) -> Raw<'a> {
-        /// Every other byte of a word, and a two in each of these places.
-        const EVEN_BYTES: u64 = 0x00ff_00ff_00ff_00ff;
-        const TWOS: u64 = 0x0002_0002_0002_0002;
         let (width, height) = (self.width.div_ceil(2), self.height.div_ceil(2));
         halved.clear();
         halved.resize(width * height, 0);
         for (y, out) in halved.chunks_exact_mut(width).enumerate() {
             let row = |y: usize| &self.pixels[y.min(self.height - 1) * self.width..][..self.width];
-            let (upper, upper_rest) = row(2 * y).as_chunks::<8>();
-            let (lower, lower_rest) = row(2 * y + 1).as_chunks::<8>();
-            let (out, out_rest) = out.split_at_mut(4 * upper.len());
-            for (out, (a, b)) in out.as_chunks_mut::<4>().0.iter_mut().zip(upper.iter().zip(lower)) {
-                // Four sums side by side in one word, and a half for rounding.
-                let words = [a, b].map(|p| u64::from_le_bytes(*p));
-                let sums = words.iter().fold(TWOS, |sum, w| sum + (w & EVEN_BYTES) + (w >> 8 & EVEN_BYTES)) >> 2;
-                *out = [sums as u8, (sums >> 16) as u8, (sums >> 32) as u8, (sums >> 48) as u8];
-            }
-            for (out, (a, b)) in out_rest.iter_mut().zip(upper_rest.chunks(2).zip(lower_rest.chunks(2))) {
-                let sum: usize = [a, b].iter().flat_map(|p| [p[0], p[p.len() - 1]]).map(usize::from).sum();
-                *out = ((sum + 2) / 4) as u8;
-            }
+            widely!(halve_rows(row(2 * y), row(2 * y + 1), out));
         }
         Raw { pixels: halved, width, height, step: 2.0 * self.step }
+    }
+}
+
+/// Means of 2 x 2 pixels of two rows.
+#[inline(always)]
+fn halve_rows(upper: &[u8], lower: &[u8], out: &mut [u8]) {
+    let mean = |a: [u8; 2], b: [u8; 2]| {
+        let [a, b] = [a, b].map(u16::from_le_bytes);
+        (((a & 0xff) + (a >> 8) + (b & 0xff) + (b >> 8) + 2) >> 2) as u8
+    };
+    let ((upper, upper_rest), (lower, lower_rest)) = (upper.as_chunks(), lower.as_chunks());
+    for (out, (a, b)) in out.iter_mut().zip(upper.iter().zip(lower)) {
+        *out = mean(*a, *b);
+    }
+    if let (Some(out), [a], [b]) = (out.get_mut(upper.len()), upper_rest, lower_rest) {
+        *out = mean([*a; 2], [*b; 2]);
     }
 }
 
@@ -115,12 +117,13 @@ pub(super) struct Band {
     levels: Vec<u16>,
     /// Memory for a line of neighbouring cells: blurred across the rows only, and both ways.
     half_blurred: Vec<u16>,
-    blurred: Vec<[u16; CELL]>,
+    blurred: Vec<u16>,
 }
 
-/// Side of a cell in pixels: with its neighbours it covers what the greatest blur moves a contour by; and eight numbers of two bytes are
-/// a register of the processor.
+/// Side of a cell in pixels: with its neighbours it covers what the greatest blur moves a contour by.
 const CELL: usize = 8;
+/// Numbers of two bytes that are blurred together: what registers hold.
+const LANES: usize = 16;
 const OUTSIDE_BAND: usize = usize::MAX;
 /// Parts of a grey level, as a power of two: the sum of two levels just fits in sixteen bits.
 const LEVEL_BITS: u32 = 7;
@@ -170,18 +173,20 @@ impl Band {
     }
 
     /// Separable Gaussian blur of the marked cells of a picture, which is continued by its outermost pixels; these become `ground` then, so
-    /// that contours close within. `starts` becomes where rows of cells go over to what `is_shape`.
+    /// that contours close within. `starts` becomes where rows of cells go over to what is beyond `level`, as [`Raw::starts`].
     pub(super) fn blur(
         &mut self,
         picture: Raw<'_>,
         sigma: f64,
         ground: f32,
-        is_shape: impl Fn(f32) -> bool,
+        (level, sense): (f32, f32),
         starts: &mut Vec<Start>,
     ) {
         let weights = kernel(sigma);
         let (width, height) = (picture.width, picture.height);
         let ground = (ground.clamp(0.0, 255.0) * PARTS) as u16;
+        // Whole parts; those of a byte's levels are positive numbers of two bytes.
+        let bound = (if sense > 0.0 { (level * PARTS).floor() } else { (level * PARTS).ceil() }) as i16;
         let mut half_blurred = std::mem::take(&mut self.half_blurred);
         let mut blurred = std::mem::take(&mut self.blurred);
         let mut levels = std::mem::take(&mut self.levels);
@@ -189,9 +194,8 @@ impl Band {
         for (row, columns) in self.stretches() {
             let pixels = columns.start * CELL..columns.end * CELL;
             for y in row * CELL..height.min((row + 1) * CELL) {
-                blur_across_rows(picture, y, pixels.clone(), &weights, &mut half_blurred);
-                blur_along_row(&half_blurred, &weights, &mut blurred);
-                let line = blurred.as_flattened_mut();
+                widely!(blur_row(picture, y, pixels.clone(), &weights, &mut half_blurred, &mut blurred));
+                let line = &mut blurred[..pixels.len()];
                 if pixels.start == 0 {
                     line[0] = ground;
                 }
@@ -205,8 +209,12 @@ impl Band {
                         starts.push(Start { x: pixels.start + x, y });
                     }
                 };
-                changes(line, |level| is_shape(f32::from(level) / PARTS), change);
-                for (column, part) in columns.clone().zip(&blurred) {
+                if sense > 0.0 {
+                    changes(line, |p| p as i16 > bound, change);
+                } else {
+                    changes(line, |p| (p as i16) < bound, change);
+                }
+                for (column, part) in columns.clone().zip(line.as_chunks::<CELL>().0) {
                     levels[self.cells[row * self.columns + column] + y % CELL * CELL..][..CELL].copy_from_slice(part);
                 }
             }
@@ -215,14 +223,31 @@ impl Band {
     }
 }
 
+/// Blurs pixels of row `y` across the rows (`line`) and then along the row.
+#[inline(always)]
+fn blur_row(
+    picture: Raw<'_>,
+    y: usize,
+    pixels: Range<usize>,
+    weights: &[u16],
+    line: &mut Vec<u16>,
+    blurred: &mut Vec<u16>,
+) {
+    blur_across_rows(picture, y, pixels, weights, line);
+    blur_along_row(line, weights, blurred);
+}
+
 /// Blurs the pixels of row `y` against those above and below, with so many more on either side as blurring along the row needs.
+#[inline(always)]
 fn blur_across_rows(picture: Raw<'_>, y: usize, pixels: Range<usize>, weights: &[u16], line: &mut Vec<u16>) {
     let (width, height) = (picture.width, picture.height);
     let reach = weights.len() - 1;
-    let (from, to) = (pixels.start.saturating_sub(reach), width.min(pixels.end + reach));
+    let from = pixels.start.saturating_sub(reach);
+    // Some more, lest a few are left that go through the processor one by one.
+    let to = width.min(from + (pixels.end + reach - from).next_multiple_of(LANES));
     let row_at = |y: usize| &picture.pixels[y.min(height - 1) * width..][from..to];
     line.clear();
-    line.resize(pixels.len() + 2 * reach, 0);
+    line.resize(pixels.len().next_multiple_of(LANES) + 2 * reach + LANES, 0);
     // Some may lie beyond the picture.
     let before = reach + from - pixels.start;
     let sums = &mut line[before..before + to - from];
@@ -240,23 +265,25 @@ fn blur_across_rows(picture: Raw<'_>, y: usize, pixels: Range<usize>, weights: &
     line[before + to - from..].fill(last);
 }
 
-/// Blurs a line, cell by cell; what the kernel needs on either side is not of a cell.
-fn blur_along_row(line: &[u16], weights: &[u16], blurred: &mut Vec<[u16; CELL]>) {
+/// Blurs a line; what the kernel needs on either side is not of the result.
+#[inline(always)]
+fn blur_along_row(line: &[u16], weights: &[u16], blurred: &mut Vec<u16>) {
     let reach = weights.len() - 1;
-    blurred.clear();
-    for at in (reach..line.len() - reach).step_by(CELL) {
-        let (left, right) = (&line[at - reach..at + CELL - 1], &line[at + 1..at + reach + CELL]);
-        let mut sums = [0u16; CELL];
-        for (sum, level) in sums.iter_mut().zip(&line[at..]) {
+    blurred.resize(line.len() - 2 * reach - LANES, 0);
+    for (k, out) in blurred.as_chunks_mut::<LANES>().0.iter_mut().enumerate() {
+        let needed = &line[k * LANES..][..LANES + 2 * reach];
+        let (left, right) = (&needed[..reach + LANES - 1], &needed[reach + 1..]);
+        let mut sums = [0u16; LANES];
+        for (sum, level) in sums.iter_mut().zip(&needed[reach..]) {
             *sum = scaled(*level, weights[0]);
         }
-        let pairs = left.windows(CELL).rev().zip(right.windows(CELL));
+        let pairs = left.windows(LANES).rev().zip(right.windows(LANES));
         for (&weight, (left, right)) in weights[1..].iter().zip(pairs) {
-            for i in 0..CELL {
+            for i in 0..LANES {
                 sums[i] += scaled(left[i] + right[i], weight);
             }
         }
-        blurred.push(sums);
+        *out = sums;
     }
 }
 
@@ -273,6 +300,7 @@ fn kernel(sigma: f64) -> Vec<u16> {
 }
 
 /// A level times a weight in parts of 2^16.
+#[inline(always)]
 fn scaled(level: u16, weight: u16) -> u16 {
     ((u32::from(level) * u32::from(weight)) >> 16) as u16
 }

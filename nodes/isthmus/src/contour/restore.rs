@@ -12,6 +12,7 @@
 //! at low frequencies, so that curves wider than the cut-off keep their size.
 
 use crate::Point;
+use crate::wide::widely;
 use nalgebra::Vector2;
 
 /// Samples of the filter's response between frequency 0 and the highest, half a turn a point.
@@ -28,7 +29,7 @@ const SIGNAL: f64 = 0.5;
 const CONTOUR_ERROR: f64 = 0.012;
 
 /// Points that are filtered together.
-const BLOCK: usize = 8;
+const BLOCK: usize = 16;
 
 /// What happened to a border between the shape and its contour. Lengths in points of the border.
 #[derive(Debug, Clone, Copy)]
@@ -88,6 +89,11 @@ impl Filter {
 
     /// Filters a closed border.
     pub(super) fn apply(&mut self, points: &[Point], filtered: &mut Vec<Point>) {
+        widely!(self.filter(points, filtered));
+    }
+
+    #[inline(always)]
+    fn filter(&mut self, points: &[Point], filtered: &mut Vec<Point>) {
         let n = points.len();
         let reach = (self.weights.len() - 1).min(n / 2);
         let weights = &self.weights[..=reach];

@@ -1,6 +1,7 @@
 //! A frame in blocks of pixels: what segmentation looks at before it looks at pixels.
 
 use super::frame::Frame;
+use crate::wide::widely;
 
 /// Blocks that are looked at to find the ground: a shape of a thousandth of the frame still has several among them.
 const SAMPLES: usize = 5_000;
@@ -25,6 +26,10 @@ pub(super) struct Blocks {
     pub(super) planes: Vec<Vec<f32>>,
     /// The blocks that are looked at to find the ground, all over the frame.
     pub(super) samples: Vec<Sample>,
+    /// Distance of these in a row, in blocks.
+    pub(super) sample_step: usize,
+    /// Their means, plane by plane.
+    pub(super) sampled: Vec<Vec<f32>>,
     sums: Vec<u16>,
 }
 
@@ -41,6 +46,7 @@ impl Blocks {
         } else {
             (step, step)
         };
+        self.sample_step = across;
         self.samples.clear();
         for row in (0..rows).step_by(down) {
             // Each row begins elsewhere, so that narrow upright shapes are hit as well.
@@ -65,9 +71,9 @@ impl Blocks {
         }
         for block_row in 0..self.rows {
             let rows = block_row * self.size..height.min((block_row + 1) * self.size);
-            // The usual blocks are summed eight pixels at a time; what is left of the row goes the common way.
+            // The usual blocks are summed several at a time; what is left of the row goes the common way.
             let done = match (&mut self.planes[..], self.size, rows.len()) {
-                ([plane], 4, 4) => sum_blocks([0, 1, 2, 3].map(|k| frame.row(rows.start + k)), plane),
+                ([plane], 4, 4) => widely!(sum_blocks([0, 1, 2, 3].map(|k| frame.row(rows.start + k)), plane)),
                 _ => 0,
             };
             if done == width {
@@ -88,25 +94,29 @@ impl Blocks {
                 }));
             }
         }
+        self.sampled.resize_with(channels, Vec::new);
+        for (sampled, plane) in self.sampled.iter_mut().zip(&self.planes) {
+            sampled.clear();
+            sampled.extend(self.samples.iter().map(|s| plane[s.block]));
+        }
     }
 }
 
-/// Appends the means of the blocks of 4 x 4 pixels of four rows, of two blocks at a time; gives the number of columns done.
+/// Appends the means of the blocks of 4 x 4 pixels of four rows; gives the number of columns done.
+#[inline(always)]
 fn sum_blocks(rows: [&[u8]; 4], means: &mut Vec<f32>) -> usize {
-    /// Every other byte, and every other pair of bytes, of a word.
-    const BYTES: u64 = 0x00ff_00ff_00ff_00ff;
-    const PAIRS: u64 = 0x0000_ffff_0000_ffff;
-    let [a, b, c, d] = rows.map(|row| row.as_chunks::<8>().0);
+    /// Every other byte of a word.
+    const BYTES: u32 = 0x00ff_00ff;
+    let [a, b, c, d] = rows.map(|row| row.as_chunks::<4>().0);
+    let words = a.iter().zip(b).zip(c).zip(d).map(|(((a, b), c), d)| [a, b, c, d].map(|p| u32::from_le_bytes(*p)));
     let from = means.len();
-    means.resize(from + 2 * a.len(), 0.0);
-    let words = a.iter().zip(b).zip(c).zip(d).map(|(((a, b), c), d)| [a, b, c, d].map(|p| u64::from_le_bytes(*p)));
-    for (means, words) in means[from..].as_chunks_mut::<2>().0.iter_mut().zip(words) {
-        // Sums side by side in one word: of the pixels of a pair, then of two pairs. No sum outgrows its sixteen bits.
+    means.resize(from + a.len(), 0.0);
+    for (mean, words) in means[from..].iter_mut().zip(words) {
+        // Sums side by side in one word, of the even and the odd pixels. None outgrows its sixteen bits.
         let pairs = words.iter().fold(0, |sum, w| sum + (w & BYTES) + (w >> 8 & BYTES));
-        let blocks = (pairs & PAIRS) + (pairs >> 16 & PAIRS);
-        *means = [blocks as u32 as i32, (blocks >> 32) as i32].map(|sum| sum as f32 / 16.0);
+        *mean = ((pairs & 0xffff) + (pairs >> 16)) as i32 as f32 / 16.0;
     }
-    a.len() * 8
+    a.len() * 4
 }
 
 /// Side of a block in pixels: small pictures have small shapes.

@@ -44,7 +44,12 @@ impl Clipping {
             let clipped = |(d, w): (&f32, &f32)| (level as f32 + d * noise).clamp(0.0, top) * w;
             deviations.iter().zip(&weights).map(clipped).sum::<f32>() / total
         };
-        let means: [f32; LEVELS] = std::array::from_fn(mean);
+        // Nothing is clipped in the middle, and the upper half is the lower one upside down.
+        let mut means: [f32; LEVELS] = std::array::from_fn(|level| level as f32);
+        for level in (0..LEVELS / 2).take_while(|level| (*level as f32) < reach) {
+            means[level] = mean(level);
+            means[LEVELS - 1 - level] = top - means[level];
+        }
         let below = std::array::from_fn(|level| means.partition_point(|m| *m < level as f32) as u16);
         Some(Self { means, below, low: reach, high: top - reach })
     }

@@ -124,10 +124,16 @@ impl Crop {
         let (block, columns) = (blocks.size, blocks.columns);
         let (mut shape, mut clear) = (Vec::new(), Vec::new());
         let step = (self.width * self.height / NOISE_SAMPLES).max(1);
+        let (mut across, mut down) = (0, 0);
         for at in (0..self.pixels.len() - 1).step_by(step) {
-            let (x, y) = (self.x + (at % self.width) as i32, self.y + (at / self.width) as i32);
+            let (x, y) = (self.x + across as i32, self.y + down);
+            let is_last = across + 1 == self.width;
+            across += step;
+            while across >= self.width {
+                (across, down) = (across - self.width, down + 1);
+            }
             let (column, row) = (x.max(0) as usize / block, y.max(0) as usize / block);
-            if x < 0 || y < 0 || column >= columns || row >= blocks.rows || (at + 1) % self.width == 0 {
+            if x < 0 || y < 0 || column >= columns || row >= blocks.rows || is_last {
                 continue;
             }
             let here = row * columns + column;

@@ -13,6 +13,7 @@ use super::frame::Frame;
 use super::metric::Metric;
 use super::statistics::{NORMAL_MAD, median, otsu};
 use super::surface::{AlongRow, Surface};
+use crate::wide::widely;
 use nalgebra::Vector3;
 
 /// The ground and what stands out from it.
@@ -40,6 +41,19 @@ impl Ground {
         let block = row * blocks.columns + column;
         let Some(clipping) = &self.clipping else { return self.residual[block] };
         self.difference([column as f64, row as f64], |c| clipping.level(blocks.planes[c][block]))
+    }
+
+    /// The same of a tile of so many blocks a side, by its first one, and its middle.
+    pub(super) fn tile_contrast(&self, blocks: &Blocks, (column, row): (usize, usize), side: usize) -> ([f64; 2], f32) {
+        let (columns, rows) = (column..blocks.columns.min(column + side), row..blocks.rows.min(row + side));
+        let count = (columns.len() * rows.len()) as f32;
+        let mean = |plane: &[f32]| {
+            rows.clone().map(|row| plane[row * blocks.columns..][columns.clone()].iter().sum::<f32>()).sum::<f32>()
+                / count
+        };
+        let level = |mean: f32| self.clipping.as_ref().map_or(mean, |clipping| clipping.level(mean));
+        let middle = [&columns, &rows].map(|range| (range.start + range.end - 1) as f64 / 2.0);
+        (middle, self.difference(middle, |c| level(mean(&blocks.planes[c]))))
     }
 
     /// The ground along a row, from a column in steps.
@@ -83,6 +97,7 @@ impl GroundRow<'_> {
     }
 
     /// Fills a row with its differences from the ground; `values` gives the row's levels in a channel.
+    #[inline(always)]
     pub(super) fn fill_differences<I: Iterator<Item = f32>>(
         &self,
         values: impl Fn(usize) -> I,
@@ -117,8 +132,10 @@ const MIN_RELATIVE_RESIDUAL: f32 = 0.12;
 const CLASS_CLARITY: f32 = 4.0;
 /// Shapes that stand out by fewer deviations may do so from a wrong ground, one side of uneven light taken for shape.
 const CLEAR: f32 = 2.0 * CLASS_CLARITY;
-/// Blocks used for the fit: more do not make a quadratic any better.
-const FIT_SAMPLES: usize = 800;
+/// Blocks used for a fit that tells what belongs to the ground.
+const CLASS_SAMPLES: usize = 400;
+/// ... and for the one that tells the ground's level: half-way between shape and ground is known half as well as the ground.
+const LEVEL_SAMPLES: usize = 1_600;
 /// One in so many of the ground's blocks tells its scatter: a median of a thousand is known to a thirtieth.
 const SCATTER_STEP: usize = 4;
 /// Median of the largest of three such deviations: of those in three channels.
@@ -128,6 +145,8 @@ const ROUNDS: usize = 3;
 /// Depths in the frame, as parts of its smaller side, at which rows and columns vote for the ground: beyond scanner edges, and
 /// before most shapes.
 const RIM_DEPTHS: [f64; 4] = [0.0, 0.01, 0.02, 0.04];
+/// Blocks that vote along a side, at least: shares are known to a few percent.
+const RIM_SAMPLES: usize = 64;
 /// Share of the rim from which a class is the ground beyond doubt. In a tight crop of a shape with two straight sides along
 /// the rim about half the rim is shape.
 const SURE_SHARE: f64 = 0.62;
@@ -175,7 +194,7 @@ pub(super) fn candidates(blocks: &Blocks) -> Vec<Candidate> {
         .iter()
         .map(|channel| {
             let values: Vec<f32> = match channel {
-                Channel::Plane(c) => blocks.samples.iter().map(|s| planes[*c][s.block]).collect(),
+                Channel::Plane(c) => blocks.sampled[*c].clone(),
                 _ => blocks.samples.iter().map(|s| channel.at(planes, s.block)).collect(),
             };
             let split = otsu(&values);
@@ -200,8 +219,9 @@ fn rim_blocks(blocks: &Blocks) -> impl Iterator<Item = usize> {
     let (columns, rows) = (blocks.columns, blocks.rows);
     RIM_DEPTHS.into_iter().flat_map(move |depth| {
         let d = (depth * columns.min(rows) as f64) as usize;
-        let across = (d..columns - d).flat_map(move |c| [d * columns + c, (rows - 1 - d) * columns + c]);
-        let down = (d..rows - d).flat_map(move |r| [r * columns + d, r * columns + columns - 1 - d]);
+        let along = |side: usize| (d..side - d).step_by((side / RIM_SAMPLES).max(1));
+        let across = along(columns).flat_map(move |c| [d * columns + c, (rows - 1 - d) * columns + c]);
+        let down = along(rows).flat_map(move |r| [r * columns + d, r * columns + columns - 1 - d]);
         across.chain(down)
     })
 }
@@ -229,14 +249,16 @@ fn along_rim(blocks: &Blocks) -> Candidate {
 fn fit(frame: &Frame<'_>, blocks: &Blocks, candidate: Candidate, residual: Vec<f32>) -> Ground {
     let Candidate { mut is_ground } = candidate;
     let mut ground = Ground::default();
-    let mut residuals = Vec::with_capacity(is_ground.len());
+    let as_is = |mean| mean;
+    let mut residuals = vec![0.0; is_ground.len()];
     for _ in 0..ROUNDS {
-        ground.surfaces = blocks.planes.iter().map(|plane| fit_surface(blocks, plane, &is_ground, None)).collect();
+        ground.surfaces = blocks
+            .sampled
+            .iter()
+            .map(|levels| fit_surface(blocks, levels, &is_ground, CLASS_SAMPLES, &as_is))
+            .collect();
         ground.metric = metric(blocks, &ground.surfaces, &is_ground);
-        let residual_of =
-            |s: &Sample| ground.difference([s.column, s.row].map(f64::from), |c| blocks.planes[c][s.block]);
-        residuals.clear();
-        residuals.extend(blocks.samples.iter().map(residual_of));
+        widely!(fill_sampled(blocks, &ground, &mut residuals));
         let of_ground = residuals.iter().zip(&is_ground).filter(|(_, g)| **g);
         let scatter: Vec<f32> = of_ground.step_by(SCATTER_STEP).map(|(r, _)| *r).collect();
         let sigma = median(scatter) / if ground.surfaces.len() == 1 { NORMAL_MAD } else { LARGEST_OF_THREE };
@@ -259,13 +281,19 @@ fn fit(frame: &Frame<'_>, blocks: &Blocks, candidate: Candidate, residual: Vec<f
             break;
         }
     }
-    ground.residual = residual;
-    ground.residual.resize(blocks.columns * blocks.rows, 0.0);
-    fill_residuals(blocks, &mut ground);
     ground.clipping = clipping(frame, blocks, &is_ground);
+    let fit = |level: &dyn Fn(f32) -> f32| {
+        blocks.sampled.iter().map(|sampled| fit_surface(blocks, sampled, &is_ground, LEVEL_SAMPLES, level)).collect()
+    };
+    if ground.clipping.is_none() {
+        ground.surfaces = fit(&as_is);
+    }
+    let mut residual = residual;
+    residual.resize(blocks.columns * blocks.rows, 0.0);
+    widely!(fill_residuals(blocks, &ground, &mut residual));
+    ground.residual = residual;
     if let Some(clipping) = &ground.clipping {
-        let fit = |plane: &Vec<f32>| fit_surface(blocks, plane, &is_ground, Some(clipping));
-        ground.surfaces = blocks.planes.iter().map(fit).collect();
+        ground.surfaces = fit(&|mean| clipping.level(mean));
     }
     ground
 }
@@ -283,20 +311,34 @@ fn metric(blocks: &Blocks, surfaces: &[Surface], is_ground: &[bool]) -> Option<M
 }
 
 /// Finds by how much each block differs from the ground.
-fn fill_residuals(blocks: &Blocks, ground: &mut Ground) {
-    let mut residual = std::mem::take(&mut ground.residual);
+#[inline(always)]
+fn fill_residuals(blocks: &Blocks, ground: &Ground, residual: &mut [f32]) {
     for (row, residuals) in residual.chunks_exact_mut(blocks.columns).enumerate() {
         let values = |c: usize| blocks.planes[c][row * blocks.columns..][..blocks.columns].iter().copied();
         ground.along(row as f64, 0.0, 1.0).fill_differences(values, residuals);
     }
-    ground.residual = residual;
+}
+
+/// The same of [`Blocks::samples`].
+#[inline(always)]
+fn fill_sampled(blocks: &Blocks, ground: &Ground, residuals: &mut [f32]) {
+    let mut from = 0;
+    for samples in blocks.samples.chunk_by(|a, b| a.row == b.row) {
+        let (first, to) = (samples[0], from + samples.len());
+        let values = |c: usize| blocks.sampled[c][from..to].iter().copied();
+        let row = ground.along(f64::from(first.row), f64::from(first.column), blocks.sample_step as f64);
+        row.fill_differences(values, &mut residuals[from..to]);
+        from = to;
+    }
 }
 
 /// What noise does to the levels of a frame, if it reaches beyond black or white anywhere.
 fn clipping(frame: &Frame<'_>, blocks: &Blocks, is_ground: &[bool]) -> Option<Clipping> {
-    let levels = blocks.samples.iter().flat_map(|s| blocks.planes.iter().map(|plane| plane[s.block]));
-    let (low, high) = levels.fold((f32::MAX, f32::MIN), |(low, high), level| (low.min(level), high.max(level)));
-    Clipping::of(noise(frame, blocks, is_ground), [low, high])
+    let levels = blocks.sampled.iter().flatten();
+    let range = levels.fold([f32::MAX, f32::MIN], |[low, high], &level| {
+        [if level < low { level } else { low }, if level > high { level } else { high }]
+    });
+    Clipping::of(noise(frame, blocks, is_ground), range)
 }
 
 /// Standard deviation of the grey levels of a frame's ground, from differences of neighbouring pixels.
@@ -315,12 +357,18 @@ fn noise(frame: &Frame<'_>, blocks: &Blocks, is_ground: &[bool]) -> f32 {
     median(chosen.map(difference).collect()) / MEDIAN
 }
 
-/// Fits a surface to the ground's blocks.
-fn fit_surface(blocks: &Blocks, plane: &[f32], is_ground: &[bool], clipping: Option<&Clipping>) -> Surface {
+/// Fits a surface to the ground's blocks, or to so many of them, about; `level` gives the level that a mean stands for.
+fn fit_surface(
+    blocks: &Blocks,
+    sampled: &[f32],
+    is_ground: &[bool],
+    most: usize,
+    level: &dyn Fn(f32) -> f32,
+) -> Surface {
     let total = is_ground.iter().filter(|g| **g).count();
-    let stride = (total / FIT_SAMPLES).max(1);
-    let chosen = blocks.samples.iter().zip(is_ground).filter(|(_, is_ground)| **is_ground).step_by(stride);
-    let level = |level| clipping.map_or(level, |clipping| clipping.level(level));
-    let samples = chosen.map(|(s, _)| ([f64::from(s.column), f64::from(s.row)], level(plane[s.block])));
+    let stride = (total / most).max(1);
+    let all = blocks.samples.iter().zip(sampled).zip(is_ground);
+    let chosen = all.filter(|(_, is_ground)| **is_ground).step_by(stride);
+    let samples = chosen.map(|((s, mean), _)| ([f64::from(s.column), f64::from(s.row)], level(*mean)));
     Surface::fit([blocks.columns, blocks.rows], samples)
 }

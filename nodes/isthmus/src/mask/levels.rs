@@ -5,7 +5,8 @@ use super::ground::Ground;
 use super::runs::Component;
 use super::standing::{MAX_DEPTH, Standing};
 use super::statistics::{median, quantile};
-use super::surface::Surface;
+use super::surface::{AlongRow, Surface};
+use crate::wide::widely;
 
 /// Most spread of the shape's level (between its quartiles, noise aside), as a part of the contrast, at which the pixels are cut out
 /// as they are: the contour half-way moves by a thirtieth of the edge's blur at most.
@@ -31,8 +32,11 @@ const BORDER_BLOCKS: usize = 3;
 const LEAST_LIGHT: f32 = 0.5;
 /// Blocks of a shape looked at to measure its levels, roughly: beyond, medians get no better.
 const LEVEL_SAMPLES: usize = 1_000;
-/// The same where they are noisy and their course is sought.
-const NOISY_SAMPLES: usize = 8_000;
+/// Most blocks that are looked at.
+const MOST_SAMPLES: usize = 8_000;
+/// Side of the tiles of blocks of which means are taken where blocks are noisy, and their course is sought: tiles of four blocks, of so many samples,
+/// tell it to a thousandth of the contrast at any noise.
+const TILE: usize = 2;
 
 /// How a contrast runs over a component's bounding box, in blocks.
 #[derive(Debug, Default)]
@@ -70,6 +74,11 @@ pub(super) struct Levels {
 /// A block: column and row.
 type Block = (usize, usize);
 
+/// Its middle.
+fn middle((column, row): Block) -> [f64; 2] {
+    [column as f64, row as f64]
+}
+
 /// A component, block by block.
 struct Region<'a> {
     standing: &'a Standing<'a>,
@@ -106,12 +115,11 @@ impl Region<'_> {
         (c.top..c.bottom).flat_map(move |row| (c.left..c.right).map(move |column| (column, row)))
     }
 
-    /// Blocks from which all directions lead through the component for a while, or out of the frame: of so many evenly spread, about.
-    fn inner(&self, samples: usize) -> Vec<Block> {
+    /// Blocks from which all directions lead through the component for a while, or out of the frame: every so many in rows and columns.
+    fn inner(&self, step: usize) -> Vec<Block> {
         let Standing { blocks, components, .. } = *self.standing;
         let c = self.bounds;
         let reach = ((LEVEL_DEPTH * (c.area as f64).sqrt()) as usize).clamp(1, MAX_LEVEL_DEPTH / blocks.size);
-        let step = (((c.area / samples) as f64).sqrt() as usize).max(1);
         // The box, wider by the reach on either side; beyond the frame it is as along the frame's edge.
         let width = c.right - c.left + 2 * reach;
         let within = c.left.saturating_sub(reach)..blocks.columns.min(c.right + reach);
@@ -193,20 +201,19 @@ impl Levels {
     /// Takes sense and contrast from the body of a component; whether that has one contrast, or one that runs smoothly.
     fn take_body(&mut self, region: &Region<'_>) -> bool {
         let scatter = region.standing.ground.scatter;
-        let mut inner = region.inner(LEVEL_SAMPLES);
+        let step = (((region.bounds.area / LEVEL_SAMPLES) as f64).sqrt() as usize).max(1);
+        let inner = region.inner(step);
         self.take_sense(region, &inner);
-        let mut contrasts = region.contrasts(&inner);
-        self.contrast = quantile(&mut contrasts, 0.5);
+        let contrasts = region.contrasts(&inner);
+        self.contrast = median(contrasts.clone());
         if inner.is_empty() {
             return false;
         }
-        if self.is_ground_even(region) && is_uniform(&mut contrasts, self.contrast, scatter) {
+        if self.is_ground_even(region) && is_uniform(&mut contrasts.clone(), self.contrast, scatter) {
             return true;
         }
-        if scatter > MAP_NOISE * self.contrast {
-            inner = region.inner(NOISY_SAMPLES);
-        }
-        self.take_smooth(region, &inner)
+        let side = if scatter > MAP_NOISE * self.contrast { step.min(TILE) } else { 1 };
+        self.take_smooth(region, &inner, &contrasts, side)
     }
 
     /// Takes the contrast of a component that has no even body (thin, or printed on) from its blocks beyond the blur of its edge.
@@ -217,18 +224,18 @@ impl Levels {
         let is_deep = |depth: u8| depth >= settled;
         let deep: Vec<Block> =
             region.blocks().zip(&depths).filter(|(_, depth)| is_deep(**depth)).map(|(block, _)| block).collect();
-        let mut contrasts = region.contrasts(&deep);
+        let contrasts = region.contrasts(&deep);
         if settled < INNER_DEPTH {
             // Thinner than three blocks: the strongest blocks are the best there is.
-            self.contrast = quantile(&mut contrasts, 0.9);
+            self.contrast = quantile(&mut contrasts.clone(), 0.9);
             if !self.is_ground_even(region) {
                 self.course = Course::Map(vec![self.contrast; depths.len()]);
             }
             return;
         }
-        self.contrast = quantile(&mut contrasts, 0.5);
-        let is_even = self.is_ground_even(region) && is_uniform(&mut contrasts, self.contrast, scatter);
-        if is_even || self.take_smooth(region, &deep) {
+        self.contrast = median(contrasts.clone());
+        let is_even = self.is_ground_even(region) && is_uniform(&mut contrasts.clone(), self.contrast, scatter);
+        if is_even || self.take_smooth(region, &deep, &contrasts, 1) {
             return;
         }
         let contrast_of = |(block, depth): (Block, &u8)| if is_deep(*depth) { region.contrast(block) } else { 0.0 };
@@ -238,16 +245,29 @@ impl Levels {
         self.course = Course::Map(self.spread_out(map, 2.0 * region.standing.ground.threshold, reach, noise));
     }
 
-    /// Takes the contrast of blocks for a smooth surface over the component, if it is one.
-    fn take_smooth(&mut self, region: &Region<'_>, inner: &[Block]) -> bool {
-        let local = |(column, row): Block| [(column - self.left) as f64, (row - self.top) as f64];
-        let chosen = inner.iter().step_by((inner.len() / NOISY_SAMPLES).max(1));
-        let samples: Vec<([f64; 2], f32)> = chosen.map(|block| (local(*block), region.contrast(*block))).collect();
-        let light = Surface::fit([self.width, self.height], samples.iter().copied());
+    /// Takes the contrast of blocks for a smooth surface over the component, if it is one; it is fitted to tiles of so many blocks a side.
+    fn take_smooth(&mut self, region: &Region<'_>, inner: &[Block], contrasts: &[f32], side: usize) -> bool {
+        let local = |[column, row]: [f64; 2]| [column - self.left as f64, row - self.top as f64];
+        let chosen = || inner.iter().zip(contrasts).step_by((inner.len() / MOST_SAMPLES).max(1));
+        let light = Surface::fit(
+            [self.width, self.height],
+            chosen().map(|(block, contrast)| {
+                let (middle, contrast) = if side > 1 {
+                    region.standing.ground.tile_contrast(region.standing.blocks, *block, side)
+                } else {
+                    (middle(*block), *contrast)
+                };
+                (local(middle), contrast)
+            }),
+        );
         let [right, bottom] = [self.width, self.height].map(|side| (side - 1) as f64);
         let corners = [(0.0, 0.0), (right, 0.0), (0.0, bottom), (right, bottom)];
         let is_light = corners.iter().all(|(x, y)| light.at(*x, *y) >= LEAST_LIGHT * self.contrast);
-        let mut residuals: Vec<f32> = samples.iter().map(|([x, y], contrast)| contrast - light.at(*x, *y)).collect();
+        let residual = |(block, contrast): (&Block, &f32)| {
+            let [x, y] = local(middle(*block));
+            contrast - light.at(x, y)
+        };
+        let mut residuals: Vec<f32> = chosen().map(residual).collect();
         let is_smooth = is_light && is_uniform(&mut residuals, self.contrast, region.standing.ground.scatter);
         if is_smooth {
             self.course = Course::Smooth(light);
@@ -368,12 +388,8 @@ impl Levels {
         let ground = rows.ground.along(row, column, step);
         let signed = ground.grey().filter(|_| self.one_sided);
         if let (Some(ground), Course::Smooth(light)) = (signed, &self.course) {
-            // Neighbouring pixels go through the processor together, all the way.
             let light = self.light_along(light, block, (y, from));
-            let range = self.sense * range;
-            for (i, (out, p)) in out.iter_mut().zip(source).enumerate() {
-                *out = rounded(ground_level + range * (f32::from(*p) - ground.at(i)) / light(i));
-            }
+            widely!(divide_row(source, (ground, light), (self.sense * range, ground_level), out));
             return;
         }
         let [difference, reciprocals] = &mut rows.lines;
@@ -396,12 +412,27 @@ impl Levels {
     }
 }
 
+/// Fills a row of pixels with their difference from the ground, divided by the light there; neighbouring ones go through the processor together,
+/// all the way.
+#[inline(always)]
+fn divide_row(
+    source: &[u8],
+    (ground, light): (AlongRow, impl Fn(usize) -> f32),
+    (range, level): (f32, f32),
+    out: &mut [u8],
+) {
+    for (i, (out, p)) in out.iter_mut().zip(source).enumerate() {
+        *out = rounded(level + range * (f32::from(*p) - ground.at(i)) / light(i));
+    }
+}
+
 /// A place in blocks, from one in pixels: block k has its centre at pixel `k * block + (block - 1) / 2`.
 fn in_blocks(pixel: usize, block: usize) -> f64 {
     (pixel as f64 - (block - 1) as f64 / 2.0) / block as f64
 }
 
 /// A level of the 8-bit scale.
+#[inline(always)]
 fn rounded(level: f32) -> u8 {
     /// Floating point numbers of this size have no fraction: added to it, a number from 0 to 255 is rounded, and its whole part is the lowest
     /// byte.
@@ -412,6 +443,7 @@ fn rounded(level: f32) -> u8 {
 }
 
 /// The larger of two numbers in one instruction of the processor: `f32::max` takes more, lest one is not a number.
+#[inline(always)]
 fn larger(a: f32, b: f32) -> f32 {
     if a > b { a } else { b }
 }

@@ -32,6 +32,7 @@ impl Metric {
     }
 
     /// Length of a difference: the largest of the channels, as everywhere.
+    #[inline(always)]
     pub(super) fn length(&self, [r, g, b]: [f32; 3]) -> f32 {
         let channel = |w: &[f32; 3]| (w[0] * r + w[1] * g + w[2] * b).abs();
         self.0.iter().map(channel).fold(0.0, |most, d| if d > most { d } else { most })

@@ -4,7 +4,11 @@
 //! one pass and what its outliers cost.
 
 use super::statistics::{NORMAL_MAD, median};
+use crate::wide::widely;
 use nalgebra::{Matrix6, Vector6};
+
+/// Residuals that tell how far samples scatter: a median of a thousand is known to a thirtieth.
+const SPREAD_SAMPLES: usize = 1_000;
 
 /// A quadratic surface over a frame or a part of it, in block coordinates scaled to -1..1.
 #[derive(Debug, Clone, Copy)]
@@ -20,12 +24,11 @@ impl Surface {
         let scale = size.map(|n| 2.0 / (n.max(2) - 1) as f64);
         let samples: Vec<([f64; 2], f32)> = levels.collect();
         let mut sums = NormalEquations::default();
-        for (place, level) in &samples {
-            sums.add(scaled(scale, *place), f64::from(*level), 1.0);
-        }
+        widely!(sums.add_all(&samples, scale));
         let first = Self { coefficients: sums.solve(), scale };
         let residuals: Vec<f32> = samples.iter().map(|([x, y], level)| (level - first.at(*x, *y)).abs()).collect();
-        let limit = (3.0 / NORMAL_MAD * median(residuals.clone())).max(1.0);
+        let few = residuals.iter().step_by((residuals.len() / SPREAD_SAMPLES).max(1));
+        let limit = (3.0 / NORMAL_MAD * median(few.copied().collect())).max(1.0);
         for ((place, level), _) in samples.iter().zip(&residuals).filter(|(_, residual)| **residual > limit) {
             sums.add(scaled(scale, *place), f64::from(*level), -1.0);
         }
@@ -56,6 +59,7 @@ pub(super) struct AlongRow([f32; 3]);
 
 impl AlongRow {
     /// Level after so many steps.
+    #[inline(always)]
     pub(super) fn at(&self, steps: usize) -> f32 {
         // A row is no longer than a number of four bytes, which the processor turns into a float several at a time.
         let i = steps as i32 as f32;
@@ -64,6 +68,7 @@ impl AlongRow {
 }
 
 /// A place in the coordinates of a surface.
+#[inline(always)]
 fn scaled(scale: [f64; 2], [column, row]: [f64; 2]) -> [f64; 2] {
     [column * scale[0] - 1.0, row * scale[1] - 1.0]
 }
@@ -79,7 +84,16 @@ struct NormalEquations {
 }
 
 impl NormalEquations {
+    /// Adds samples.
+    #[inline(always)]
+    fn add_all(&mut self, samples: &[([f64; 2], f32)], scale: [f64; 2]) {
+        for (place, level) in samples {
+            self.add(scaled(scale, *place), f64::from(*level), 1.0);
+        }
+    }
+
     /// Adds a sample (of weight 1), or takes it away again (-1).
+    #[inline(always)]
     fn add(&mut self, [u, v]: [f64; 2], level: f64, weight: f64) {
         let (uu, uv, vv) = (u * u, u * v, v * v);
         let powers =
