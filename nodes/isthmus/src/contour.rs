@@ -283,7 +283,10 @@ impl Border {
 
     /// Fills the border with equally spaced points of a closed polygon, about `self.spacing` apart.
     fn resample(&mut self, polygon: &[Point]) -> Result<(), ContourError> {
-        self.resample_by(polygon, |i, t| polygon[i] + (polygon[(i + 1) % polygon.len()] - polygon[i]) * t)
+        self.resample_by(polygon, |i, t| {
+            let next = if i + 1 == polygon.len() { polygon[0] } else { polygon[i + 1] };
+            polygon[i] + (next - polygon[i]) * t
+        })
     }
 
     /// Fills the border with equally spaced points, about `self.spacing` apart, of a curve through (almost) equally spaced
@@ -291,7 +294,8 @@ impl Border {
     fn resample_curve(&mut self, points: &[Point]) -> Result<(), ContourError> {
         let n = points.len();
         self.resample_by(points, |i, t| {
-            let [a, b, c, d] = [i + n - 1, i, i + 1, i + 2].map(|k| points[k % n].coords);
+            let wrapped = |k: usize| points[if k < n { k } else { k - n }].coords;
+            let [a, b, c, d] = [i + n - 1, i, i + 1, i + 2].map(wrapped);
             let (slope, next_slope) = ((c - a) * 0.5, (d - b) * 0.5);
             let (u, chord) = (1.0 - t, c - b);
             Point::from(b + chord * t + ((slope - chord) * u - (next_slope - chord) * t) * (t * u))
@@ -480,7 +484,11 @@ impl Tracer {
     fn fourth_difference(&mut self, border: &Border, step: usize) -> f64 {
         let p = &border.points;
         let n = p.len();
-        let at = |i: usize, steps: usize| p[(i + steps * step) % n].coords;
+        // A border has some more points than these reach.
+        let at = |i: usize, steps: usize| {
+            let k = i + steps * step;
+            p[if k < n { k } else { k % n }].coords
+        };
         self.deviations.clear();
         self.deviations.extend((0..n).step_by(2).map(|i| {
             let tangent = at(i, 4) - at(i, 0);

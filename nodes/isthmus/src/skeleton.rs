@@ -105,9 +105,9 @@ const MIN_HEIGHT_NOISE: f64 = 8.0;
 /// of the box lie on it as a whole.
 pub const EXOSKELETON_MARGIN: f64 = 0.1;
 
-/// Distance of the triangulated border points, as a part of the square root of the shape's area: three eighths of the radius of the
+/// Distance of the triangulated border points, as a part of the square root of the shape's area: half the radius of the
 /// tightest curves that the border keeps.
-const STEP: f64 = 0.015;
+const STEP: f64 = 0.02;
 /// Greatest number of border steps from one triangulated point to the next.
 const MAX_STRIDE: usize = 6;
 /// Where two parts of the border are nearer to each other than this many steps, the step is halved: a passage is then found to
@@ -245,20 +245,17 @@ impl Triangulation {
     /// Prunes the skeleton; gives the skeleton's graph: for each triangle that stays, its neighbours that stay.
     fn peel(&self, polarity: Polarity, least: f64) -> Graph {
         let count = self.discs.len();
-        let is_open = |side: usize| {
-            let t = side / 3;
-            self.polarity[t] == polarity && self.discs[t].distance <= self.extent && self.is_passage(side)
-        };
+        let is_open = |t: usize| self.polarity[t] == polarity && self.discs[t].distance <= self.extent;
         // Ways out of each triangle that are not yet peeled; the one over the hull, to infinity, never is.
-        let mut degree: Vec<u8> = (0..count).map(|t| (3 * t..3 * t + 3).map(|s| u8::from(is_open(s))).sum()).collect();
+        let ways = |t: usize| (3 * t..3 * t + 3).filter(|s| self.is_passage(*s));
+        let mut degree: Vec<u8> = (0..count).map(|t| if is_open(t) { ways(t).count() as u8 } else { 0 }).collect();
         // The end of the skeleton that reaches furthest beyond a triangle's disc, and the neighbour it lies behind.
         let mut tip: Vec<(SkeletonPoint, usize)> = self.discs.iter().map(|d| (*d, NO_NEIGHBOUR)).collect();
         let mut peeled = vec![false; count];
         let mut stays = vec![false; count];
         let mut ends: Vec<usize> = (0..count).filter(|&t| degree[t] == 1).collect();
         while let Some(t) = ends.pop() {
-            let open = (3 * t..3 * t + 3).filter(|s| is_open(*s));
-            let next = open.filter_map(|s| self.beyond(s)).find(|next| !peeled[*next]);
+            let next = ways(t).filter_map(|s| self.beyond(s)).find(|next| !peeled[*next]);
             let Some(next) = next else { continue };
             peeled[t] = true;
             let reach = |tip: &SkeletonPoint| (tip.point - self.discs[next].point).norm() + tip.distance;

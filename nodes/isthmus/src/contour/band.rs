@@ -1,7 +1,6 @@
 //! Grey levels near a contour: as they are, at half the resolution, or blurred against noise.
 //!
-//! What is far from the contour is never looked at: the picture is blurred in cells that the contour goes through, and in their
-//! neighbours, in fixed point, eight pixels at a time.
+//! What is far from the contour is never looked at: the picture is blurred in cells near the contour, in fixed point, eight pixels at a time.
 
 use super::iso::{Picture, Start};
 use crate::Point;
@@ -36,9 +35,11 @@ impl Raw<'_> {
         let (x, y) = (p.x.clamp(0.0, (self.width - 1) as f64), p.y.clamp(0.0, (self.height - 1) as f64));
         let (i, j) = (x as u32 as usize, y as u32 as usize);
         let (u, v) = (x - i as f64, y - j as f64);
-        let (i1, j1) = ((i + 1).min(self.width - 1), (j + 1).min(self.height - 1));
-        let at = |x: usize, y: usize| f64::from(self.pixels[y * self.width + x]);
-        let (upper, lower) = (at(i, j) + (at(i1, j) - at(i, j)) * u, at(i, j1) + (at(i1, j1) - at(i, j1)) * u);
+        let first = j * self.width + i;
+        let right = usize::from(i + 1 < self.width);
+        let below = if j + 1 < self.height { self.width } else { 0 };
+        let [a, b, c, d] = [0, right, below, below + right].map(|step| f64::from(self.pixels[first + step]));
+        let (upper, lower) = (a + (b - a) * u, c + (d - c) * u);
         upper + (lower - upper) * v
     }
 
@@ -80,7 +81,6 @@ impl Raw<'_> {
     /// The picture at half the resolution: means of 2 x 2 pixels; of an odd side the last pixel counts twice.
     pub(super) fn halved<'a>(&self, halved: &'a mut Vec<u8>) -> Raw<'a> {
         let (width, height) = (self.width.div_ceil(2), self.height.div_ceil(2));
-        halved.clear();
         halved.resize(width * height, 0);
         for (y, out) in halved.chunks_exact_mut(width).enumerate() {
             let row = |y: usize| &self.pixels[y.min(self.height - 1) * self.width..][..self.width];
@@ -120,8 +120,10 @@ pub(super) struct Band {
     blurred: Vec<u16>,
 }
 
-/// Side of a cell in pixels: with its neighbours it covers what the greatest blur moves a contour by.
+/// Side of a cell in pixels.
 const CELL: usize = 8;
+/// Distance of a contour in which pixels are blurred: twice the greatest blur, in pixels of the picture that is blurred.
+const REACH: usize = 4;
 /// Numbers of two bytes that are blurred together: what registers hold.
 const LANES: usize = 16;
 const OUTSIDE_BAND: usize = usize::MAX;
@@ -132,22 +134,25 @@ const PARTS: f32 = (1 << LEVEL_BITS) as f32;
 const KERNEL_EXTENT: f64 = 3.0;
 
 impl Band {
-    /// Takes the cells that a contour goes through, and their neighbours.
+    /// Takes the cells within [`REACH`] of a contour.
     pub(super) fn mark(&mut self, contour: impl Iterator<Item = Point>, [width, height]: [usize; 2]) {
         self.columns = width.div_ceil(CELL);
         let rows = height.div_ceil(CELL);
         self.cells.clear();
         self.cells.resize(self.columns * rows, OUTSIDE_BAND);
         let mut marked = None;
+        let cells = |at: f64, count: usize| {
+            let at = at as u32 as usize;
+            (at.saturating_sub(REACH) / CELL, ((at + REACH) / CELL).min(count - 1))
+        };
         for p in contour {
-            let (column, row) = ((p.x as usize / CELL).min(self.columns - 1), (p.y as usize / CELL).min(rows - 1));
-            if marked.replace((column, row)) == Some((column, row)) {
+            let (columns, across) = (cells(p.x, self.columns), cells(p.y, rows));
+            if marked.replace((columns, across)) == Some((columns, across)) {
                 continue;
             }
-            let columns = column.saturating_sub(1)..self.columns.min(column + 2);
-            for row in row.saturating_sub(1)..rows.min(row + 2) {
+            for row in across.0..=across.1 {
                 // Any number but that of cells outside; what it is follows when all are known.
-                self.cells[row * self.columns + columns.start..row * self.columns + columns.end].fill(0);
+                self.cells[row * self.columns..][columns.0..=columns.1].fill(0);
             }
         }
         let mut begin = 0;
@@ -155,7 +160,6 @@ impl Band {
             *cell = begin;
             begin += CELL * CELL;
         }
-        self.levels.clear();
         self.levels.resize(begin, 0);
     }
 

@@ -61,7 +61,10 @@ pub(super) struct Start {
 /// Traces contours, keeping its buffers from one picture to the next.
 #[derive(Debug, Clone, Default)]
 pub(super) struct Contours {
+    /// Pixels to the right of an upward step so far, of which...
     visited: Vec<bool>,
+    /// ... these are set: few, so that the others need not be cleared for the next picture.
+    marked: Vec<usize>,
     current: Vec<Point>,
     /// The longest contour found.
     pub(super) longest: Vec<Point>,
@@ -71,13 +74,19 @@ impl Contours {
     /// Traces all contours that go up to the left of `starts` and keeps the longest outer one; whether there is any.
     pub(super) fn trace<P: Picture>(&mut self, raster: &Raster<P>, starts: &[Start]) -> bool {
         let [width, height] = raster.picture.size();
-        self.visited.clear();
+        for at in self.marked.drain(..) {
+            self.visited[at] = false;
+        }
         self.visited.resize(width * height, false);
         self.longest.clear();
         for &Start { x, y } in starts {
             let is_rim = x == 0 || y == 0 || y + 1 >= height;
             if !is_rim && !self.visited[y * width + x] && raster.value(x - 1, y) <= 0.0 {
-                raster.follow(x, y, &mut self.visited, &mut self.current);
+                let before = self.marked.len();
+                raster.follow(x, y, &mut self.marked, &mut self.current);
+                for at in &self.marked[before..] {
+                    self.visited[*at] = true;
+                }
                 if self.current.len() > self.longest.len() && shoelace(&self.current) > 0.0 {
                     std::mem::swap(&mut self.current, &mut self.longest);
                 }
@@ -129,8 +138,8 @@ impl<P: Picture> Raster<P> {
     }
 
     /// Follows the contour that runs up between the pixels `(x - 1, y)` (ground) and `(x, y)` (shape), the shape on its
-    /// right-hand side. Marks the shape pixels to the right of its upward steps.
-    fn follow(&self, x: usize, y: usize, visited: &mut [bool], contour: &mut Vec<Point>) {
+    /// right-hand side. Lists the shape pixels to the right of its upward steps.
+    fn follow(&self, x: usize, y: usize, marked: &mut Vec<usize>, contour: &mut Vec<Point>) {
         contour.clear();
         let [width, _] = self.picture.size();
         let value = |x: usize, y: usize| self.value(x, y);
@@ -164,7 +173,7 @@ impl<P: Picture> Raster<P> {
             });
             (x, y, entry) = match exit {
                 Side::Top => {
-                    visited[y * width + x + 1] = true;
+                    marked.push(y * width + x + 1);
                     (x, y - 1, Side::Bottom)
                 }
                 Side::Right => (x + 1, y, Side::Left),

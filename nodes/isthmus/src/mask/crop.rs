@@ -74,31 +74,30 @@ impl Crop {
             (self.shape_level, self.ground_level) = (127.5 + contrast / 2.0, 127.5 - contrast / 2.0);
         }
         let ground_pixel = self.ground_level.round().clamp(0.0, 255.0) as u8;
-        self.pixels.clear();
-        let (width, x) = (self.width, self.x);
-        self.pixels.reserve(width * self.height);
+        // Each pixel is written below.
+        self.pixels.resize(self.width * self.height, ground_pixel);
+        let x = self.x;
+        let from = x.max(0) as usize;
+        let to = frame.width.min((x + self.width as i32) as usize);
+        let before = (from as i32 - x) as usize;
         let label = k as u32;
-        for row in 0..self.height {
-            let begin = self.pixels.len();
+        for (row, line) in self.pixels.chunks_exact_mut(self.width).enumerate() {
             let y = self.y + row as i32;
             if y < 0 || y >= frame.height as i32 {
-                self.pixels.resize(begin + width, ground_pixel);
+                line.fill(ground_pixel);
                 continue;
             }
             let y = y as usize;
-            let from = x.max(0) as usize;
-            let to = frame.width.min((x + width as i32) as usize);
-            let at = begin + (from as i32 - x) as usize;
-            self.pixels.resize(at, ground_pixel);
             let owners = &owner[y / block * columns..][..columns];
+            let (left, rest) = line.split_at_mut(before);
+            let (out, right) = rest.split_at_mut(to - from);
+            left.fill(ground_pixel);
+            right.fill(ground_pixel);
             if plain {
-                self.pixels.extend_from_slice(&frame.row(y)[from..to]);
+                out.copy_from_slice(&frame.row(y)[from..to]);
             } else {
-                self.pixels.resize(at + to - from, ground_pixel);
-                levels.fill_row(&mut rows, (y, from), &mut self.pixels[at..], [self.shape_level, self.ground_level]);
+                levels.fill_row(&mut rows, (y, from), out, [self.shape_level, self.ground_level]);
             }
-            self.pixels.resize(begin + width, ground_pixel);
-            let out = &mut self.pixels[at..at + to - from];
             // What belongs to other components is made ground.
             let within = from / block..to.div_ceil(block);
             let is_foreign = |owner: u32| owner != label && owner != NOBODY;
@@ -137,18 +136,22 @@ impl Crop {
                 continue;
             }
             let here = row * columns + column;
+            let is_clear = owner[here] == NOBODY;
+            if !is_clear && owner[here] != k as u32 {
+                continue;
+            }
             let (before, after) = (column.saturating_sub(1), (column + 1).min(columns - 1));
             let neighbours = [row * columns + before, row * columns + after, row.saturating_sub(1) * columns + column];
             let stands_out = |b: &usize| ground.residual[*b] > ground.threshold;
             let difference = f32::from(self.pixels[at].abs_diff(self.pixels[at + 1]));
-            if stands_out(&here) && owner[here] == k as u32 && neighbours.iter().all(stands_out) {
-                shape.push(difference);
-            } else if owner[here] == NOBODY {
+            if is_clear {
                 clear.push(difference);
+            } else if stands_out(&here) && neighbours.iter().all(stands_out) {
+                shape.push(difference);
             }
         }
         // Print and texture are not noise: half of a shape is free of them.
-        (quantile(&mut shape, 0.25) / QUARTILE).max(median(clear) / MEDIAN)
+        (quantile(&shape, 0.25) / QUARTILE).max(median(&clear) / MEDIAN)
     }
 
     /// Connects the pixels that are beyond half-way from ground to shape.

@@ -187,7 +187,7 @@ pub(super) fn candidates(blocks: &Blocks) -> Vec<Candidate> {
     let rim: Vec<usize> = rim_blocks(blocks).collect();
     let mut channels: Vec<Channel> = (0..planes.len()).map(Channel::Plane).collect();
     if let [r, g, b] = &planes[..] {
-        let colour = [r, g, b].map(|plane| median(rim.iter().map(|&k| plane[k]).collect()));
+        let colour = [r, g, b].map(|plane| median(&rim.iter().map(|&k| plane[k]).collect::<Vec<_>>()));
         channels.extend([Channel::Brightest, Channel::Darkest, Channel::Difference(colour)]);
     }
     let best = channels
@@ -261,7 +261,7 @@ fn fit(frame: &Frame<'_>, blocks: &Blocks, candidate: Candidate, residual: Vec<f
         widely!(fill_sampled(blocks, &ground, &mut residuals));
         let of_ground = residuals.iter().zip(&is_ground).filter(|(_, g)| **g);
         let scatter: Vec<f32> = of_ground.step_by(SCATTER_STEP).map(|(r, _)| *r).collect();
-        let sigma = median(scatter) / if ground.surfaces.len() == 1 { NORMAL_MAD } else { LARGEST_OF_THREE };
+        let sigma = median(&scatter) / if ground.surfaces.len() == 1 { NORMAL_MAD } else { LARGEST_OF_THREE };
         let split = otsu(&residuals);
         let standing_out = split.mean_above;
         ground.scatter = sigma;
@@ -354,7 +354,7 @@ fn noise(frame: &Frame<'_>, blocks: &Blocks, is_ground: &[bool]) -> f32 {
         let next = row.get(at + channels).unwrap_or(&row[at]);
         f32::from(row[at].abs_diff(*next))
     };
-    median(chosen.map(difference).collect()) / MEDIAN
+    median(&chosen.map(difference).collect::<Vec<_>>()) / MEDIAN
 }
 
 /// Fits a surface to the ground's blocks, or to so many of them, about; `level` gives the level that a mean stands for.

@@ -160,7 +160,7 @@ impl Region<'_> {
         }
         let counts = by_depth.each_ref().map(Vec::len);
         let most = counts.iter().max().copied().unwrap_or(0);
-        let medians = by_depth.map(median);
+        let medians = by_depth.map(|levels| median(&levels));
         // Few blocks are no measure, and too few to learn local levels from.
         let enough = |depth: u8| counts[usize::from(depth)] * 4 >= most;
         let deepest = (1..=MAX_DEPTH).rev().find(|d| enough(*d)).unwrap_or(1);
@@ -205,11 +205,11 @@ impl Levels {
         let inner = region.inner(step);
         self.take_sense(region, &inner);
         let contrasts = region.contrasts(&inner);
-        self.contrast = median(contrasts.clone());
+        self.contrast = median(&contrasts);
         if inner.is_empty() {
             return false;
         }
-        if self.is_ground_even(region) && is_uniform(&mut contrasts.clone(), self.contrast, scatter) {
+        if self.is_ground_even(region) && is_uniform(&contrasts, self.contrast, scatter) {
             return true;
         }
         let side = if scatter > MAP_NOISE * self.contrast { step.min(TILE) } else { 1 };
@@ -227,14 +227,14 @@ impl Levels {
         let contrasts = region.contrasts(&deep);
         if settled < INNER_DEPTH {
             // Thinner than three blocks: the strongest blocks are the best there is.
-            self.contrast = quantile(&mut contrasts.clone(), 0.9);
+            self.contrast = quantile(&contrasts, 0.9);
             if !self.is_ground_even(region) {
                 self.course = Course::Map(vec![self.contrast; depths.len()]);
             }
             return;
         }
-        self.contrast = median(contrasts.clone());
-        let is_even = self.is_ground_even(region) && is_uniform(&mut contrasts.clone(), self.contrast, scatter);
+        self.contrast = median(&contrasts);
+        let is_even = self.is_ground_even(region) && is_uniform(&contrasts, self.contrast, scatter);
         if is_even || self.take_smooth(region, &deep, &contrasts, 1) {
             return;
         }
@@ -267,8 +267,8 @@ impl Levels {
             let [x, y] = local(middle(*block));
             contrast - light.at(x, y)
         };
-        let mut residuals: Vec<f32> = chosen().map(residual).collect();
-        let is_smooth = is_light && is_uniform(&mut residuals, self.contrast, region.standing.ground.scatter);
+        let residuals: Vec<f32> = chosen().map(residual).collect();
+        let is_smooth = is_light && is_uniform(&residuals, self.contrast, region.standing.ground.scatter);
         if is_smooth {
             self.course = Course::Smooth(light);
         }
@@ -457,8 +457,8 @@ pub(super) struct RowSource<'a> {
     pub(super) lines: [Vec<f32>; 2],
 }
 
-/// Whether levels (of which the order gets lost) vary little, beside a contrast and what noise accounts for.
-fn is_uniform(levels: &mut [f32], contrast: f32, scatter: f32) -> bool {
+/// Whether levels vary little, beside a contrast and what noise accounts for.
+fn is_uniform(levels: &[f32], contrast: f32, scatter: f32) -> bool {
     /// Distance between the quartiles of a normal distribution, in standard deviations.
     const QUARTILES: f32 = 1.349;
     let spread = quantile(levels, 0.75) - quantile(levels, 0.25);

@@ -20,7 +20,8 @@ impl Metric {
         let eigen = sums.cast::<f64>().symmetric_eigen();
         let axes = eigen.eigenvectors.cast::<f32>();
         // What is no ground makes far outliers: medians rather than the sums themselves.
-        let along = |axis: usize| median(differences.iter().map(|d| axes.column(axis).dot(d).abs()).collect());
+        let along =
+            |axis: usize| median(&differences.iter().map(|d| axes.column(axis).dot(d).abs()).collect::<Vec<_>>());
         let scatter = [0, 1, 2].map(|axis| (along(axis) / NORMAL_MAD).max(MIN_SCATTER));
         let [least, most] = [f32::min, f32::max].map(|pick| scatter.into_iter().reduce(pick).unwrap_or(MIN_SCATTER));
         if most.is_nan() || most <= EVEN_SCATTER * least {

@@ -66,7 +66,8 @@ pub(super) fn sift(
             above * 2 <= total
         })
         .map_or(0, |f| f.0);
-    let typical_contrast = median(by_area.iter().filter(|f| 2 * f.0 >= typical_area).map(|f| f.1).collect());
+    let large = by_area.iter().filter(|f| 2 * f.0 >= typical_area);
+    let typical_contrast = median(&large.map(|f| f.1).collect::<Vec<_>>());
     // The lower median, small fry aside: of three shapes two of which touch, a single one.
     let usual: Vec<usize> = by_area
         .iter()

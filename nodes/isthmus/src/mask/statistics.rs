@@ -45,15 +45,18 @@ pub(super) fn otsu(values: &[f32]) -> Split {
 }
 
 /// Median of a list; 0 of an empty one.
-pub(super) fn median(mut values: Vec<f32>) -> f32 {
-    quantile(&mut values, 0.5)
+pub(super) fn median(values: &[f32]) -> f32 {
+    quantile(values, 0.5)
 }
 
-/// Quantile of a list (which gets reordered); 0 of an empty one.
-pub(super) fn quantile(values: &mut [f32], q: f64) -> f32 {
+/// Quantile of a list; 0 of an empty one.
+pub(super) fn quantile(values: &[f32], q: f64) -> f32 {
     if values.is_empty() {
         return 0.0;
     }
     let k = ((values.len() - 1) as f64 * q) as usize;
-    *values.select_nth_unstable_by(k, f32::total_cmp).1
+    // The bits of floating point numbers, those but the sign of negative ones turned round, are whole numbers in the same order, and quicker to sort.
+    let turned = |bits: i32| bits ^ ((bits >> 31) & i32::MAX);
+    let mut keys: Vec<i32> = values.iter().map(|v| turned(v.to_bits() as i32)).collect();
+    f32::from_bits(turned(*keys.select_nth_unstable(k).1) as u32)
 }

@@ -28,7 +28,7 @@ impl Surface {
         let first = Self { coefficients: sums.solve(), scale };
         let residuals: Vec<f32> = samples.iter().map(|([x, y], level)| (level - first.at(*x, *y)).abs()).collect();
         let few = residuals.iter().step_by((residuals.len() / SPREAD_SAMPLES).max(1));
-        let limit = (3.0 / NORMAL_MAD * median(few.copied().collect())).max(1.0);
+        let limit = (3.0 / NORMAL_MAD * median(&few.copied().collect::<Vec<_>>())).max(1.0);
         for ((place, level), _) in samples.iter().zip(&residuals).filter(|(_, residual)| **residual > limit) {
             sums.add(scaled(scale, *place), f64::from(*level), -1.0);
         }
