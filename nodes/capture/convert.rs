@@ -391,7 +391,7 @@ pub fn why_empty(segmentation: &mask::Segmentation) -> String {
     }
 }
 
-/// What is wrong with a segmentation, in words: pieces left out, and pieces that had to be cut apart.
+/// What is wrong with a segmentation, in words: pieces left out, pieces that had to be cut apart, and pieces beside shadows.
 pub fn left_out(segmentation: &mask::Segmentation) -> Vec<String> {
     let shape = |aoi: &Aoi| format!("the shape of {} x {} px at ({}, {})", aoi.width, aoi.height, aoi.x, aoi.y);
     let rejected = segmentation.rejected.iter().filter_map(|rejected| {
@@ -406,7 +406,11 @@ pub fn left_out(segmentation: &mask::Segmentation) -> Vec<String> {
     let separated = segmentation.separated.iter().map(|aoi| {
         format!("{} is pieces that touch; cut apart, their borders are straight where they touched", shape(aoi))
     });
-    rejected.chain(separated).collect()
+    let shaded = segmentation.shaded.len();
+    let shaded = (shaded > 0).then(|| {
+        format!("{shaded} shape(s) cast a shadow; where it lies beside them their borders are told less exactly")
+    });
+    rejected.chain(separated).chain(shaded).collect()
 }
 
 /// The message of one piece.

@@ -12,7 +12,7 @@
 //! 4. *Pixels*: about each component the frame is cut out, in a form in which half-way between two fixed levels is half-way
 //!    between the shape's own level near the border and the ground's: as it is, where both are uniform, else
 //!    divided by the local contrast. Pixels beyond half-way are joined to components once more: neighbours whose shadows
-//!    or glow met come apart. Threads that hang on a shape (hairs) are taken off.
+//!    or glow met come apart. Where a part of the border is soft, it is sought within the shadow that makes it so ([`Segmentation::shaded`]). Threads that hang on a shape (hairs) are taken off.
 //! 5. *Rejection*, each with its [`Reason`]: cut by the frame's edge, too small beside the others, thread-like (hairs,
 //!    scanner edges), faint without a crisp edge (glare), two shapes that touch (of about twice the usual area, with an isthmus between the halves). Where that
 //!    isthmus is too narrow to be the neck of one of them they are cut apart instead ([`Segmentation::separated`]).
@@ -44,6 +44,7 @@ mod levels;
 mod metric;
 mod runs;
 mod segmentation;
+mod shadows;
 mod sift;
 mod standing;
 mod statistics;
@@ -58,6 +59,7 @@ use blocks::Blocks;
 use crop::Crop;
 use ground::Ground;
 use runs::Components;
+use shadows::Shadows;
 use sift::{Found, sift};
 use standing::Standing;
 use threads::Threads;
@@ -79,6 +81,7 @@ pub struct Segmenter {
     residual: Vec<f32>,
     crop: Crop,
     threads: Threads,
+    shadows: Shadows,
 }
 
 impl Segmenter {
@@ -133,10 +136,14 @@ impl Segmenter {
             }
             self.crop.take(frame, &standing, k);
             self.crop.label(&mut self.fine);
+            let shaded = self.crop.lift_shadows(&self.fine, &mut self.shadows, parameters);
+            if shaded {
+                self.crop.label(&mut self.fine);
+            }
             if self.crop.erase_threads(&self.fine, &mut self.threads, parameters) {
                 self.crop.label(&mut self.fine);
             }
-            self.collect(frame, parameters, &mut found, &mut rejected);
+            self.collect(frame, parameters, shaded, &mut found, &mut rejected);
         }
         sift(frame, parameters, found, rejected)
     }
@@ -146,6 +153,7 @@ impl Segmenter {
         &self,
         frame: &Frame<'_>,
         parameters: &Parameters,
+        shaded: bool,
         found: &mut Vec<Found>,
         rejected: &mut Vec<Rejected>,
     ) {
@@ -168,7 +176,7 @@ impl Segmenter {
             }
             let contact = self.rim_contact(frame, index);
             let cutout = crop.cutout(&self.fine, index);
-            found.push(Found { cutout, area: c.area, contact, contrast: crop.contrast });
+            found.push(Found { cutout, area: c.area, contact, contrast: crop.contrast, shaded });
         }
     }
 

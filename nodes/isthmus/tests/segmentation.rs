@@ -4,9 +4,9 @@
 
 mod shapes;
 
-use isthmus::Extractor;
 use isthmus::contour::Border;
 use isthmus::mask::{Frame, Parameters, Reason, Segmentation, segment};
+use isthmus::{Extractor, Point};
 use rand::{SeedableRng, rngs::StdRng};
 use shapes::{Camera, Neck, Piece, blur, normal, pose};
 
@@ -187,6 +187,81 @@ fn a_dark_piece_among_bright_ones_is_no_glare() {
     let found = grey(&pixels);
     assert_eq!(found.cutouts.len(), 3);
     assert!(found.rejected.iter().any(|r| r.reason == Reason::Faint), "{:?}", found.rejected);
+}
+
+/// Part of a lamp that pieces hide from the ground: their upper edges cast shadows of a length, the lower the shorter and the less soft.
+fn shadow(coverage: &[f64], length: f64, softness: f64) -> Vec<f64> {
+    const LAYERS: usize = 6;
+    let mut shadow = vec![0.0f64; coverage.len()];
+    for height in (1..=LAYERS).map(|layer| layer as f64 / LAYERS as f64) {
+        let (x, y) = ((0.8 * length * height).round() as usize, (0.6 * length * height).round() as usize);
+        let mut layer = vec![0.0; coverage.len()];
+        layer[y * SIDE + x..].copy_from_slice(&coverage[..coverage.len() - y * SIDE - x]);
+        blur(&mut layer, SIDE, SIDE, softness * height);
+        shadow.iter_mut().zip(layer).for_each(|(shadow, layer)| *shadow = shadow.max(layer));
+    }
+    shadow
+}
+
+/// Shadows of half and more of what pieces and ground differ by, darker than the ground as well where pieces are brighter.
+#[test]
+fn a_deep_shadow() {
+    /// Most that a border's points may lie beside the true outline, at corners (which blur rounds) and in shadow, and the border as a whole, in pixels.
+    const POINTS: f64 = 1.6;
+    const BORDER: f64 = 0.3;
+    let (coverage, necks) = coverage();
+    let outline = |(k, (x, y))| Piece::random(SIZE, 10 + k as u64).outline(&pose(0.2 + 0.1 * k as f64, 1.0, x, y));
+    let truth: Vec<Border> = CENTRES
+        .into_iter()
+        .enumerate()
+        .map(|place| Border::from_points_spaced(&outline(place), 0.25).unwrap())
+        .collect();
+    for (piece, ground, light, length, softness) in [
+        ([60.0; 3], [225.0; 3], 0.5, 14.0, 3.0),
+        ([120.0; 3], [225.0; 3], 0.72, 28.0, 6.0),
+        ([220.0; 3], [130.0; 3], 0.6, 14.0, 3.0),
+        ([50.0, 90.0, 190.0], [225.0, 222.0, 218.0], 0.5, 28.0, 6.0),
+    ] {
+        let what = format!("{piece:?} on {ground:?}, shadow of {length} px");
+        let shadow = shadow(&coverage, length, softness);
+        let mut rng = StdRng::seed_from_u64(9);
+        let mut pixels = Vec::with_capacity(3 * coverage.len());
+        for (c, shadow) in coverage.iter().zip(&shadow) {
+            for (piece, ground) in piece.into_iter().zip(ground) {
+                let level = ground * (1.0 - (1.0 - light) * shadow) * (1.0 - c) + piece * c + 3.0 * normal(&mut rng);
+                pixels.push(level.round().clamp(0.0, 255.0) as u8);
+            }
+        }
+        let found = if piece == [piece[0]; 3] {
+            grey(&pixels.iter().copied().step_by(3).collect::<Vec<_>>())
+        } else {
+            segment(&Frame::rgb(SIDE as u32, SIDE as u32, &pixels).unwrap(), &Parameters::default())
+        };
+        check(&found, &necks, &what);
+        assert_eq!(found.shaded.len(), CENTRES.len(), "{what}");
+        for border in found.cutouts.iter().map(|c| Border::from_cutout(c).unwrap().0) {
+            let off = |truth: &Border| (truth.centroid() - border.centroid()).norm();
+            let truth = truth.iter().min_by(|a, b| off(a).total_cmp(&off(b))).unwrap();
+            let mean = (border.area() - truth.area()) / truth.length();
+            assert!(mean.abs() < BORDER, "{what}: the border lies {mean} px outside");
+            let beside = |p: &Point| truth.points.iter().map(|q| (p - q).norm()).fold(f64::MAX, f64::min);
+            let most = border.points.iter().map(beside).fold(0.0, f64::max);
+            assert!(most < POINTS, "{what}: the border is {most} px off");
+        }
+    }
+}
+
+/// Pictures out of focus, uneven light and noise are no shadows.
+#[test]
+fn what_is_soft_all_round_is_no_shadow() {
+    for (blur, vignette, noise) in
+        [(0.0, 0.0, 0.0), (2.0, 0.0, 3.0), (4.0, 0.0, 3.0), (4.0, 0.5, 8.0), (1.0, 0.5, 20.0)]
+    {
+        let (pixels, necks) = scene(Camera { blur, vignette, noise, ..Camera::default() });
+        let found = grey(&pixels);
+        check(&found, &necks, &format!("blur {blur}"));
+        assert_eq!(found.shaded, [], "blur {blur}, vignette {vignette}, noise {noise}");
+    }
 }
 
 #[test]

@@ -210,7 +210,7 @@ impl Crop {
     }
 
     /// Grey level of ground.
-    fn ground_pixel(&self) -> u8 {
+    pub(super) fn ground_pixel(&self) -> u8 {
         self.ground_level.round().clamp(0.0, 255.0) as u8
     }
 

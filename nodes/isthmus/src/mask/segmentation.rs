@@ -63,6 +63,8 @@ pub struct Segmentation {
     /// Bounding boxes of shapes that touched and were cut apart, in the same order; their border is a straight line where they
     /// touched.
     pub separated: Vec<Aoi>,
+    /// Bounding boxes of shapes beside which a shadow was told from them, in the same order; their border there is that of shape and shadow.
+    pub shaded: Vec<Aoi>,
 }
 
 /// Specks smaller than this, in pixels, are not reported: noise and dust make any number of them.

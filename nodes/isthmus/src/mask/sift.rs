@@ -46,6 +46,8 @@ pub(super) struct Found {
     pub(super) area: usize,
     pub(super) contact: usize,
     pub(super) contrast: f32,
+    /// Whether a shadow beside it was told from it.
+    pub(super) shaded: bool,
 }
 
 /// Rejects what is cut by the frame, or small or faint beside the other shapes.
@@ -78,6 +80,7 @@ pub(super) fn sift(
     let rim = 2 * (frame.width + frame.height);
     let mut cutouts = Vec::new();
     let mut separated = Vec::new();
+    let mut shaded = Vec::new();
     let mut open = found;
     while let Some(f) = open.pop() {
         let aoi = f.cutout.aoi;
@@ -109,13 +112,19 @@ pub(super) fn sift(
         };
         match reason {
             Some(reason) => rejected.push(Rejected { aoi, area: f.area, reason }),
-            None => cutouts.push(f.cutout),
+            None => {
+                if f.shaded {
+                    shaded.push(aoi);
+                }
+                cutouts.push(f.cutout);
+            }
         }
     }
     separated.sort_by_key(|aoi| (aoi.y, aoi.x));
+    shaded.sort_by_key(|aoi| (aoi.y, aoi.x));
     cutouts.sort_by_key(|c| (c.aoi.y, c.aoi.x));
     rejected.sort_by_key(|r| (r.aoi.y, r.aoi.x));
-    Segmentation { cutouts, rejected, separated }
+    Segmentation { cutouts, rejected, separated, shaded }
 }
 
 /// Whether the level falls off at the border of a shape rather than all over it: the edge of a piece, however faint, does, those of glare and
@@ -185,6 +194,7 @@ fn part(found: &Found, contact: [Point; 2], area: f64) -> Vec<Found> {
         area: components.list[index].area,
         contact: 0,
         contrast: found.contrast,
+        shaded: found.shaded,
     };
     parts.into_iter().map(part).collect()
 }
