@@ -396,6 +396,9 @@ impl Closure {
         closed.sort_by(f64::total_cmp);
         let decoy_wide = closed[(closed.len() - 1) / 2] / MAXWELL_MEDIAN;
         let expected = OTHERS * closed.len() as f64 / sets;
+        // What the decoys say of the number of chance loops weighs as so many loops: less if there are few, and never more
+        // than decoys are like them (a gamma distribution, its greatest value at what is expected).
+        let known = (1.0 / expected + DECOY_DEVIATION * DECOY_DEVIATION).recip();
         let rate = ((decoys.akin as f64 + 1.0) / (OTHERS * sets * found.len() as f64 + 1.0)).clamp(guess.rate, 1.0);
         let mut distances: Vec<f64> = found.iter().map(|l| l.distance).collect();
         distances.sort_by(f64::total_cmp);
@@ -414,11 +417,15 @@ impl Closure {
             return best.1;
         }
         let prior = |scale: f64, expected: f64, deviation: f64| 0.5 * ((scale / expected).ln() / deviation).powi(2);
+        let count_prior = |chance: f64| {
+            let times = chance / (expected * share);
+            known * (times - times.ln())
+        };
         // All of them by chance: as many as both the decoys and the loops themselves say.
         let all = 0.5 * (distances.len() as f64 + expected * share);
         let by_chance = |(wide, densities): &(f64, Vec<f64>)| {
             let sum: f64 = densities.iter().map(|g| (all * g).max(f64::MIN_POSITIVE).ln()).sum();
-            sum - all - prior(*wide, decoy_wide, DECOY_DEVIATION)
+            sum - all - count_prior(all) - prior(*wide, decoy_wide, DECOY_DEVIATION)
         };
         let by_chance = wides.iter().map(by_chance).fold(f64::NEG_INFINITY, f64::max);
         for narrow in scales(guess.narrow * (-2.0 * GUESS_DEVIATION).exp(), decoy_wide * reach / LEAST_RATIO) {
@@ -445,6 +452,7 @@ impl Closure {
                 let value = sum
                     - right
                     - chance
+                    - count_prior(chance)
                     - prior(narrow, guess.narrow, GUESS_DEVIATION)
                     - prior(*wide, decoy_wide, DECOY_DEVIATION);
                 if value > best.0 {
@@ -483,8 +491,9 @@ impl Closure {
     }
 }
 
-/// Chance loops close at least this much wider than true ones, or nothing can tell them apart.
-const LEAST_RATIO: f64 = 3.0;
+/// Chance loops close at least this much wider than true ones: were it less, little could tell them apart; were it more,
+/// true loops of worn pieces, which close half as wide, would pass for chance.
+const LEAST_RATIO: f64 = 2.5;
 /// Poses in islands are off by this much more than those of two steps.
 const DRIFT: f64 = 1.5;
 
