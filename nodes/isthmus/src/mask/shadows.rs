@@ -161,7 +161,7 @@ impl Shadows {
         self.flood(components, width, height);
         self.find_distance(width, height);
         let line = || self.distance.iter().zip(&self.steepness).filter(|(d, _)| **d == 1).map(|(_, s)| *s);
-        let sharp = (median(&mut line().map(f32::from).collect::<Vec<_>>()) / 2.0) as u8;
+        let sharp = (median(&line().map(f32::from).collect::<Vec<_>>()) / 2.0) as u8;
         let is_left = |k: &usize| self.depth[*k] > 0 && self.sides[*k] == Side::Ground && self.distance[*k] > FAR;
         let left: Vec<usize> = (0..self.levels.len()).filter(is_left).collect();
         let edged = left.iter().filter(|k| self.steepness[**k] > sharp).count();
