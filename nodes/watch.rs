@@ -36,7 +36,7 @@ const BAD_INPUT: u8 = 2;
 /// Wait until the puzzle is assembled; print where its pieces go, and write assembly.json and assembly.png.
 ///
 /// Exit code 0 only if the puzzle was complete, 1 if it was not by the time limit (what there is, is written), 2 for bad
-/// input.
+/// input, 3 if the middleware failed and it is to be started again.
 #[derive(Debug, Args)]
 pub struct WatchArgs {
     /// Folder for the results; made if it isn't there.

@@ -27,6 +27,9 @@ const SILENCE: Duration = Duration::from_secs(10);
 /// How much longer than it listens a process may take to start and to end.
 const MARGIN: Duration = Duration::from_secs(60);
 
+/// Exit code of a process that asks to be started again, as `cell.sh` does.
+const AGAIN: i32 = 3;
+
 /// How often is looked whether a process has ended.
 const LOOK: Duration = Duration::from_millis(20);
 
@@ -78,8 +81,13 @@ impl Cell {
         let out = self.path(&format!("seen_{}", enclave.unwrap_or("none").trim_matches('/')));
         let (pieces, seconds) = (pieces.to_string(), patience.as_secs().to_string());
         let args = ["watch", "--timeout", &seconds, "--pieces", &pieces, "--out", out.to_str().unwrap()];
-        let mut watcher = self.start(env!("CARGO_BIN_EXE_jigsaw"), enclave, &args);
-        let status = watcher.wait(patience + MARGIN);
+        let start = || self.start(env!("CARGO_BIN_EXE_jigsaw"), enclave, &args);
+        let mut watcher = start();
+        let mut status = watcher.wait(patience + MARGIN);
+        if status.code() == Some(AGAIN) {
+            watcher = start();
+            status = watcher.wait(patience + MARGIN);
+        }
         (status, out, watcher.said())
     }
 }
