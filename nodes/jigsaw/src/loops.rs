@@ -424,8 +424,10 @@ impl Closure {
         // All of them by chance: as many as both the decoys and the loops themselves say.
         let all = 0.5 * (distances.len() as f64 + expected * share);
         let by_chance = |(wide, densities): &(f64, Vec<f64>)| {
-            let sum: f64 = densities.iter().map(|g| (all * g).max(f64::MIN_POSITIVE).ln()).sum();
-            sum - all - count_prior(all) - prior(*wide, decoy_wide, DECOY_DEVIATION)
+            log_product(densities.iter().map(|g| all * g))
+                - all
+                - count_prior(all)
+                - prior(*wide, decoy_wide, DECOY_DEVIATION)
         };
         let by_chance = wides.iter().map(by_chance).fold(f64::NEG_INFINITY, f64::max);
         for narrow in scales(guess.narrow * (-2.0 * GUESS_DEVIATION).exp(), decoy_wide * reach / LEAST_RATIO) {
@@ -448,8 +450,7 @@ impl Closure {
                         break;
                     }
                 }
-                let sum: f64 = densities().map(|d| both(right, chance, d).1.ln()).sum();
-                let value = sum
+                let value = log_product(densities().map(|d| both(right, chance, d).1))
                     - right
                     - chance
                     - count_prior(chance)
@@ -496,6 +497,18 @@ impl Closure {
 const LEAST_RATIO: f64 = 2.5;
 /// Poses in islands are off by this much more than those of two steps.
 const DRIFT: f64 = 1.5;
+
+/// Logarithm of a product of positive numbers, which may be too small for one.
+fn log_product(factors: impl Iterator<Item = f64>) -> f64 {
+    /// The least that a factor is taken for, and the range in which products can take one more.
+    const LEAST: f64 = 1e-200;
+    const SAFE: std::ops::Range<f64> = 1e-100..1e100;
+    let (sum, product) = factors.fold((0.0, 1.0), |(sum, product), factor| {
+        let product: f64 = product * factor.max(LEAST);
+        if SAFE.contains(&product) { (sum, product) } else { (sum + product.ln(), 1.0) }
+    });
+    sum + product.ln()
+}
 
 /// Median of a Maxwell distribution, in its scale.
 const MAXWELL_MEDIAN: f64 = 1.538;

@@ -71,10 +71,11 @@ impl Assembler<'_> {
     /// Finds loops among the best candidates to calibrate closure, clearance and residual, then, with what was learnt,
     /// among more. The best come first; what is more likely chance is left out.
     pub(super) fn close_loops(&mut self) -> Vec<loops::Loop> {
-        self.closure = self.first_guess();
+        let mut guess = self.first_guess();
+        self.closure = guess;
         let (mut first, decoys) = self.ways(FIRST_RANKS).close();
         if self.params.recalibrate {
-            self.closure = self.weigh(&decoys, &mut first);
+            self.closure = weigh(&guess, &decoys, &mut first);
             let sure = first.iter().filter(|l| l.evidence >= FOUND);
             let mut supported: Vec<usize> = sure.flat_map(|l| l.edges.iter().copied()).collect();
             supported.sort_unstable();
@@ -82,15 +83,16 @@ impl Assembler<'_> {
             self.calibrate(&supported);
             rank(&mut self.edges, &self.slots);
             self.learn(&supported);
+            guess = self.first_guess();
         }
         // The fewer candidates take part, the fewer loops close by chance: those of the best ones say more.
         let (all, more_decoys) = self.ways(LOOP_RANKS).close();
         let among = |l: &loops::Loop| l.edges.iter().all(|k| self.among(*k, FIRST_RANKS));
         let (mut best, others): (Vec<loops::Loop>, Vec<loops::Loop>) = all.into_iter().partition(among);
-        self.weigh(&decoys, &mut best);
+        weigh(&guess, &decoys, &mut best);
         let mut found = best;
         found.extend(others);
-        self.closure = self.weigh(&more_decoys, &mut found);
+        self.closure = weigh(&guess, &more_decoys, &mut found);
         self.sorted(found)
     }
 
@@ -103,15 +105,6 @@ impl Assembler<'_> {
     fn ways(&self, ranks: usize) -> loops::Ways<'_> {
         let active: Vec<usize> = (0..self.edges.len()).filter(|k| self.among(*k, ranks)).collect();
         loops::Ways::new((&self.edges, &active), (self.outlines, &self.slots), LOOSE)
-    }
-
-    /// How loops close, beside those of decoys; gives each loop the evidence that follows, unless it has more already.
-    fn weigh(&self, decoys: &loops::Decoys, found: &mut [loops::Loop]) -> Closure {
-        let closure = Closure::fit(&self.first_guess(), found, decoys);
-        for l in found {
-            l.evidence = l.evidence.max(closure.evidence(l.distance));
-        }
-        closure
     }
 
     /// How loops should close, by the residuals of the best candidates and the tolerance of the search.
@@ -264,6 +257,15 @@ impl Assembler<'_> {
     }
 }
 
+/// How loops close, beside those of decoys; gives each loop the evidence that follows, unless it has more already.
+fn weigh(guess: &Closure, decoys: &loops::Decoys, found: &mut [loops::Loop]) -> Closure {
+    let closure = Closure::fit(guess, found, decoys);
+    for l in found {
+        l.evidence = l.evidence.max(closure.evidence(l.distance));
+    }
+    closure
+}
+
 /// Ranks the candidates of each mouth and tab by cost.
 pub(super) fn rank(edges: &mut [Edge], slots: &Slots) {
     let mut order: Vec<usize> = (0..edges.len()).collect();
@@ -294,17 +296,26 @@ pub(super) fn spread_of(values: &mut [f64]) -> (f64, f64) {
 
 /// The same of values with weights.
 fn weighted_spread(values: &mut [(f64, f64)]) -> (f64, f64) {
-    let middle_of = |values: &mut [(f64, f64)]| {
-        values.sort_unstable_by(|p, q| p.0.total_cmp(&q.0));
-        let half = 0.5 * values.iter().map(|v| v.1).sum::<f64>();
-        let mut sum = 0.0;
-        let middle = values.iter().find(|v| {
-            sum += v.1;
-            sum > half
-        });
-        middle.map_or(0.0, |v| v.0)
-    };
-    let middle = middle_of(values);
+    let middle = weighted_median(values);
     values.iter_mut().for_each(|v| v.0 = (v.0 - middle).abs());
-    (middle, 1.48 * middle_of(values))
+    (middle, 1.48 * weighted_median(values))
+}
+
+/// The value up to which lies half of the weight; 0 where there is none.
+fn weighted_median(values: &mut [(f64, f64)]) -> f64 {
+    let mut half = 0.5 * values.iter().map(|v| v.1).sum::<f64>();
+    let mut rest = values;
+    while !rest.is_empty() {
+        let (below, at, above) = rest.select_nth_unstable_by(rest.len() / 2, |p, q| p.0.total_cmp(&q.0));
+        let weight = below.iter().map(|v| v.1).sum::<f64>();
+        if weight > half {
+            rest = below;
+        } else if weight + at.1 > half {
+            return at.0;
+        } else {
+            half -= weight + at.1;
+            rest = above;
+        }
+    }
+    0.0
 }
