@@ -212,8 +212,10 @@ impl Assembler<'_> {
                 let odds = share / (1.0 - share) * self.model.evidence(*best).exp();
                 let is_right = odds / (1.0 + odds);
                 sum += is_right;
-                wrong.push((*best, weight * (1.0 - is_right)));
-                wrong.extend(second.map(|second| (second, weight * is_right)));
+                if weight > 0.0 {
+                    wrong.push((*best, weight * (1.0 - is_right)));
+                    wrong.extend(second.map(|second| (second, weight * is_right)));
+                }
             }
             self.model = Model::between(right, weighted_spread(&mut wrong.clone()));
             // As if one mouth more had its tab, and one more had not.
