@@ -19,16 +19,17 @@ use jigsaw_nodes::ros::topics::{self, Topic};
 use ros2_client::{Context, MessageTypeName, Name, NodeName, NodeOptions};
 
 /// How long the secured cell may take; key exchange between all processes takes seconds.
-const PATIENCE: Duration = Duration::from_secs(90);
+const PATIENCE: Duration = Duration::from_secs(45);
+
+/// How often a listener is started that hears nothing: with RustDDS 0.15 one secured process of some hundreds is not let in by
+/// one of the others, for as long as it lives, and its next life is.
+const LIVES: usize = 3;
 
 /// How long one listens that is to hear nothing: several times what an authorised one takes to hear the first thing.
 const SILENCE: Duration = Duration::from_secs(10);
 
 /// How much longer than it listens a process may take to start and to end.
 const MARGIN: Duration = Duration::from_secs(60);
-
-/// Exit code of a process that asks to be started again, as `cell.sh` does.
-const AGAIN: i32 = 3;
 
 /// How often is looked whether a process has ended.
 const LOOK: Duration = Duration::from_millis(20);
@@ -81,14 +82,17 @@ impl Cell {
         let out = self.path(&format!("seen_{}", enclave.unwrap_or("none").trim_matches('/')));
         let (pieces, seconds) = (pieces.to_string(), patience.as_secs().to_string());
         let args = ["watch", "--timeout", &seconds, "--pieces", &pieces, "--out", out.to_str().unwrap()];
-        let start = || self.start(env!("CARGO_BIN_EXE_jigsaw"), enclave, &args);
-        let mut watcher = start();
-        let mut status = watcher.wait(patience + MARGIN);
-        if status.code() == Some(AGAIN) {
-            watcher = start();
-            status = watcher.wait(patience + MARGIN);
-        }
+        let mut watcher = self.start(env!("CARGO_BIN_EXE_jigsaw"), enclave, &args);
+        let status = watcher.wait(patience + MARGIN);
         (status, out, watcher.said())
+    }
+
+    /// Whether a listener of the cell gets the complete assembly.
+    fn is_heard(&self) -> bool {
+        (0..LIVES).any(|_| {
+            let (status, out, _) = self.watch(Some("/cell"), PATIENCE, PIECES);
+            status.success() && out.join("assembly.json").is_file()
+        })
     }
 }
 
@@ -178,8 +182,7 @@ fn the_cell_talks_among_itself_alone() {
     let _feature = cell.start(env!("CARGO_BIN_EXE_feature_node"), Some("/cell"), &[]);
     let _capture = cell.start(env!("CARGO_BIN_EXE_capture_node"), Some("/cell"), &["--ros-args", "-p", &source]);
 
-    let (status, out, _) = cell.watch(Some("/cell"), PATIENCE, PIECES);
-    assert!(status.success() && out.join("assembly.json").is_file(), "{}", solver.said());
+    assert!(cell.is_heard(), "{}", solver.said());
     assert!(solver.said().contains("secured by the enclave"));
 
     let (status, out, _) = cell.watch(None, SILENCE, PIECES);
@@ -190,8 +193,7 @@ fn the_cell_talks_among_itself_alone() {
 
     let strange = PieceFeatures { id: "in/jected".to_owned(), ..PieceFeatures::default() };
     injecting(cell.domain, &topics::PIECE_FEATURES, strange, || {
-        let (status, out, _) = cell.watch(Some("/cell"), PATIENCE, PIECES);
-        assert!(status.success() && out.join("assembly.json").is_file(), "{}", solver.said());
+        assert!(cell.is_heard(), "{}", solver.said());
     });
     assert!(!solver.said().contains("jected"), "{}", solver.said());
 }
