@@ -388,12 +388,10 @@ impl Process {
                 log::debug!("nobody was told of the end: {e}");
             }
         };
-        if matches!(result, Err(ProcessError::Deaf(_))) {
+        if let Err(error @ ProcessError::Deaf(_)) = &result {
             // A dead participant can't be taken down in order; its drop would wait for the dead thread.
             leave();
-            if let Err(error) = &result {
-                std::process::exit(say(self.name, error).into());
-            }
+            std::process::exit(say(self.name, error).into());
         }
         // When nothing of it is left that could announce itself once more.
         let participant = self.participant.take();
@@ -409,7 +407,8 @@ impl Process {
         let (signal, signalled) = oneshot::channel();
         let ending = Arc::clone(&self.ending);
         start_thread("signals", move || {
-            while let Ok(received) = signals().wait() {
+            loop {
+                let Ok(received) = signals().wait() else { return };
                 log::info!("{received}: ending");
                 let told = ending.lock().unwrap_or_else(PoisonError::into_inner).take();
                 if told.is_none_or(|ending| ending.send(()).is_err()) {

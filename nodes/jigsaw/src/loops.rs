@@ -417,12 +417,12 @@ impl Closure {
             return best.1;
         }
         let prior = |scale: f64, expected: f64, deviation: f64| 0.5 * ((scale / expected).ln() / deviation).powi(2);
-        let count_prior = |chance: f64| {
-            let times = chance / (expected * share);
-            known * (times - times.ln())
-        };
-        // All of them by chance: as many as both the decoys and the loops themselves say.
-        let all = 0.5 * (distances.len() as f64 + expected * share);
+        let expected = expected * share;
+        let count_prior = |chance: f64| known * (chance / expected - (chance / expected).ln());
+        // The decoys' count weighs like the loops' own.
+        let counted = |loops: f64| 0.5 * (loops + expected);
+        // All of them by chance.
+        let all = counted(distances.len() as f64);
         let by_chance = |(wide, densities): &(f64, Vec<f64>)| {
             log_product(densities.iter().map(|g| all * g))
                 - all
@@ -433,7 +433,7 @@ impl Closure {
         for narrow in scales(guess.narrow * (-2.0 * GUESS_DEVIATION).exp(), decoy_wide * reach / LEAST_RATIO) {
             let right_densities = densities(narrow);
             // Scales that are alike have counts that are: the next begin where the last have settled.
-            let (mut right, mut chance) = (0.5 * distances.len() as f64, expected * share);
+            let (mut right, mut chance) = (0.5 * distances.len() as f64, expected);
             for (wide, chance_densities) in wides.iter().filter(|w| w.0 >= LEAST_RATIO * narrow) {
                 right = right.max(LEAST * distances.len() as f64);
                 let densities = || right_densities.iter().zip(chance_densities);
@@ -443,8 +443,7 @@ impl Closure {
                 for _ in 0..STEPS {
                     let before = right;
                     let among_right: f64 = densities().map(|d| both(right, chance, d)).map(|(f, both)| f / both).sum();
-                    // The decoys' count weighs like the loops' own.
-                    chance = 0.5 * (distances.len() as f64 - among_right + expected * share);
+                    chance = counted(distances.len() as f64 - among_right);
                     right = among_right;
                     if (right - before).abs() <= SETTLED * distances.len() as f64 {
                         break;

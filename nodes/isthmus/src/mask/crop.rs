@@ -73,7 +73,7 @@ impl Crop {
             let contrast = (127.5 / (0.5 + DIVIDED_ROOM * noise)).min(MAX_DIVIDED_CONTRAST);
             (self.shape_level, self.ground_level) = (127.5 + contrast / 2.0, 127.5 - contrast / 2.0);
         }
-        let ground_pixel = self.ground_level.round().clamp(0.0, 255.0) as u8;
+        let ground_pixel = self.ground_pixel();
         // Each pixel is written below.
         self.pixels.resize(self.width * self.height, ground_pixel);
         let x = self.x;

@@ -72,10 +72,9 @@ impl Assembler<'_> {
     /// among more. The best come first; what is more likely chance is left out.
     pub(super) fn close_loops(&mut self) -> Vec<loops::Loop> {
         let mut guess = self.first_guess();
-        self.closure = guess;
         let (mut first, decoys) = self.ways(FIRST_RANKS).close();
         if self.params.recalibrate {
-            self.closure = weigh(&guess, &decoys, &mut first);
+            weigh(&guess, &decoys, &mut first);
             let sure = first.iter().filter(|l| l.evidence >= FOUND);
             let mut supported: Vec<usize> = sure.flat_map(|l| l.edges.iter().copied()).collect();
             supported.sort_unstable();
@@ -147,10 +146,11 @@ impl Assembler<'_> {
 
     /// Clearance and residual of true matings, from supported ones; costs follow.
     fn calibrate(&mut self, supported: &[usize]) {
+        if supported.is_empty() {
+            return;
+        }
         let mut clearances: Vec<f64> = supported.iter().map(|k| self.joints[*k].fit.clearance).collect();
-        let Some(mean) = median(&mut clearances) else { return };
-        let mut off: Vec<f64> = clearances.iter().map(|c| (c - mean).abs()).collect();
-        let deviation = 1.48 * median(&mut off).unwrap_or(0.0);
+        let (mean, deviation) = spread_of(&mut clearances);
         // Small sets measure the deviation badly, and clearances may differ from cut to cut.
         self.prior.mean = mean;
         self.prior.deviation = deviation.max(0.002 * self.scale);
