@@ -3,7 +3,7 @@
 //! A name must be the same whenever the same frame is seen again, after a restart as well, and must differ for different
 //! pieces. So it is made from what identifies the frame: the file's name, or the stamp of the message.
 //! A camera that looks at an unmoved table sends every piece again with every frame; one that covers the place of a
-//! known piece of the same topic is that piece.
+//! known piece of the same camera is that piece. A camera's frames may come on two topics, raw and compressed.
 
 use std::collections::{HashMap, VecDeque};
 
@@ -33,6 +33,20 @@ impl FrameName {
             Self::Stamp(_, sec, nanosec) => plain(&format!("{sec}_{nanosec:09}")),
         }
     }
+
+    /// What frames have in common whose pieces would have the same names: two topics may have frames of one stamp.
+    fn key(&self) -> String {
+        match self {
+            Self::File(name) => name.clone(),
+            Self::Stamp(..) => self.base(),
+        }
+    }
+}
+
+/// The camera that a topic is of: image transports send its frames once more, compressed, on a topic named after the raw
+/// one.
+pub fn camera(topic: &str) -> &str {
+    topic.strip_suffix("/compressed").unwrap_or(topic)
 }
 
 fn stem(file: &str) -> &str {
@@ -63,8 +77,9 @@ pub struct Admission {
 /// The frames and pieces seen so far.
 #[derive(Debug, Default)]
 pub struct Known {
-    frames: HashMap<FrameName, Vec<(u64, Vec<String>)>>,
-    frame_order: VecDeque<FrameName>,
+    /// By their keys: hash of the content, names of the pieces.
+    frames: HashMap<String, Vec<(u64, Vec<String>)>>,
+    frame_order: VecDeque<String>,
     files: HashMap<String, String>,
     places: VecDeque<Place>,
 }
@@ -72,7 +87,7 @@ pub struct Known {
 #[derive(Debug)]
 struct Place {
     id: String,
-    source: String,
+    camera: String,
     aoi: Aoi,
     bits: Vec<u64>,
     area: u32,
@@ -82,7 +97,7 @@ impl Known {
     /// Names the cutouts of a frame. `content` is a hash of the frame's content; `overlap` the share of area from which
     /// a piece counts as seen before.
     pub fn admit(&mut self, frame: &FrameName, content: u64, cutouts: &[Cutout], overlap: f64) -> Vec<Admission> {
-        let seen = self.frames.get(frame);
+        let seen = self.frames.get(&frame.key());
         if let Some((_, ids)) =
             seen.and_then(|all| all.iter().find(|(hash, ids)| (*hash, ids.len()) == (content, cutouts.len())))
         {
@@ -91,7 +106,7 @@ impl Known {
         }
         let mut base = frame.base();
         if seen.is_some_and(|all| !all.is_empty()) {
-            // Another frame with the stamp of a known one (some cameras leave it zero).
+            // Another frame with the stamp of a known one (some cameras leave it zero, or send frames in two ways).
             base = format!("{base}_{content:016x}");
         }
         if let FrameName::File(name) = frame {
@@ -131,8 +146,8 @@ impl Known {
 
     fn remember(&mut self, frame: &FrameName, content: u64, admissions: &[Admission]) {
         let ids = admissions.iter().map(|a| a.id.clone()).collect();
-        self.frames.entry(frame.clone()).or_default().push((content, ids));
-        self.frame_order.push_back(frame.clone());
+        self.frames.entry(frame.key()).or_default().push((content, ids));
+        self.frame_order.push_back(frame.key());
         if self.frame_order.len() > FRAMES_KEPT
             && let Some(oldest) = self.frame_order.pop_front()
             && let Some(contents) = self.frames.get_mut(&oldest)
@@ -150,7 +165,7 @@ impl Place {
         let Aoi { width, height, .. } = cutout.aoi;
         let mut place = Self {
             id,
-            source: source.to_owned(),
+            camera: camera(source).to_owned(),
             aoi: cutout.aoi,
             bits: vec![0; (width as usize * height as usize).div_ceil(64)],
             area: 0,
@@ -182,11 +197,11 @@ impl Place {
         self.bits[bit / 64] >> (bit % 64) & 1 == 1
     }
 
-    /// Intersection over union of the two areas; 0 for pieces of different topics.
+    /// Intersection over union of the two areas; 0 for pieces of different cameras.
     fn overlap(&self, other: &Self) -> f64 {
         let (smaller, larger) = (self.area.min(other.area), self.area.max(other.area));
         // The overlap can't exceed the ratio of the areas; the boxes must meet to have one at all.
-        if self.source != other.source || smaller == 0 || !meet(&self.aoi, &other.aoi) || smaller < larger / 2 {
+        if self.camera != other.camera || smaller == 0 || !meet(&self.aoi, &other.aoi) || smaller < larger / 2 {
             return 0.0;
         }
         let mut both = 0_u32;
@@ -262,8 +277,13 @@ mod tests {
         assert_eq!(ids(&again), [(first[0].id.as_str(), false), ("2_000000005_1", true)]);
         let other_size = known.admit(&stamp(3), 3, &[disc(100, 100, 50)], OVERLAP);
         assert_eq!(ids(&other_size), [("3_000000005", true)]);
-        let other_topic = FrameName::Stamp("/other".to_owned(), 3, 5);
-        assert!(known.admit(&other_topic, 3, &[disc(100, 100, 60)], OVERLAP)[0].publish);
+        let compressed = FrameName::Stamp("/image/compressed".to_owned(), 3, 5);
+        let other_way = known.admit(&compressed, 4, &[disc(101, 100, 50), disc(500, 100, 60)], OVERLAP);
+        assert_eq!(ids(&other_way)[0], ("3_000000005", false));
+        let other_camera = FrameName::Stamp("/other/compressed".to_owned(), 3, 5);
+        let other = known.admit(&other_camera, 5, &[disc(100, 100, 60)], OVERLAP);
+        let all = [&other_size[0].id, &other_way[1].id, &other[0].id];
+        assert!(other[0].publish && all[0] != all[1] && all[0] != all[2] && all[1] != all[2], "{all:?}");
     }
 
     #[test]

@@ -31,7 +31,7 @@ pub const SAME_PLACE_OVERLAP: Spec = Spec {
     default: Default::Double(0.97),
     unit: "",
     rule: Rule::Doubles(0.5, 1.0),
-    description: "A piece whose area coincides with that of a known piece of the same topic by at least this share \
+    description: "A piece whose area coincides with that of a known piece of the same camera by at least this share \
                   (intersection over union) is that piece, seen again; it is not published twice.",
     read_only: false,
 };

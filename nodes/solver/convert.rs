@@ -22,6 +22,7 @@ use jigsaw_msgs::visualization_msgs::msg::{Marker, MarkerArray};
 use nalgebra::{Isometry2, Point2};
 
 use crate::capture::convert::{MAX_SIDE_PX, header_fault, text_fault};
+use crate::capture::known::camera;
 use crate::feature::convert::{MAX_ID_LENGTH, SCALE_RULE, SCALES, image_message, is_piece_id};
 use crate::picture::{self, AssemblyStyle};
 use crate::ros::health::shown;
@@ -164,7 +165,7 @@ impl Sighting {
     pub fn is_same_place(&self, other: &Self) -> bool {
         let distance =
             |p: &Point| other.border_in_image.iter().map(|q| (q - p).norm_squared()).fold(f64::MAX, f64::min);
-        self.source == other.source
+        camera(&self.source) == camera(&other.source)
             && self.table == other.table
             && (self.centroid_in_image - other.centroid_in_image).norm() <= SAME_PLACE_PX
             && self.border_in_image.iter().step_by(SAME_PLACE_STRIDE).all(|p| distance(p) <= SAME_PLACE_PX.powi(2))

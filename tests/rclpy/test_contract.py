@@ -9,7 +9,7 @@ from PIL import Image as Picture
 from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
 from rcl_interfaces.srv import SetParameters
 from rclpy.qos import QoSProfile
-from sensor_msgs.msg import Image
+from sensor_msgs.msg import CompressedImage, Image
 from std_srvs.srv import Trigger
 
 from bench import (
@@ -134,6 +134,26 @@ def test_compressed_cameras_are_heard_whatever_they_offer(launcher, ros, generat
     camera = Camera(ros, "image/compressed", compressed=True, offered=offered)
     [features] = camera.show(compressed_message(grey(generate(2, 3, 5).frames[0]), Time(sec=1)))
     assert features.source == "/image/compressed"
+
+
+def test_a_camera_that_sends_its_frames_raw_and_compressed_shows_each_piece_once(launcher, ros, generate):
+    """As image transports do. The border of a piece differs a little between the two."""
+    launcher.start("capture_node")
+    launcher.start("feature_node")
+    shown, other = (grey(path) for path in generate(2, 3, 5).frames[:2])
+    camera, monitor = Camera(ros), Monitor(ros)
+    compressed = camera.node.create_publisher(CompressedImage, "image/compressed", RELIABLE)
+    camera.show(image_message(shown, Time(sec=1)))
+    ros.until(lambda: compressed.get_subscription_count() > 0, "listener on image/compressed")
+    taken = int(monitor.status("capture_node")[1]["received"])
+    stamps = [Time(sec=1), Time(sec=2)]
+    for stamp in stamps:
+        compressed.publish(compressed_message(shown, stamp, "jpeg"))
+    ros.until(
+        lambda: int(monitor.values("capture_node")["received"]) >= taken + len(stamps), "count of compressed frames"
+    )
+    camera.show(image_message(other, Time(sec=3)))
+    assert {second: len(pieces) for second, pieces in camera.features.items()} == {1: 1, 3: 1}
 
 
 def test_names_of_coordinate_frames_and_jpeg(launcher, ros, generate):
