@@ -631,7 +631,6 @@ impl Table {
         self.sightings.clear();
         self.due = None;
         self.settling = Settling::default();
-        self.transforms = TFMessage::default();
         self.solver = None;
         self.keep_journal(Journal::forget_all);
         self.health.figure("pieces", 0);
