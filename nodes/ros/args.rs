@@ -304,7 +304,9 @@ impl NodeNames {
     }
 
     fn expand(&self, name: &str) -> Result<String, ArgsError> {
-        let substituted = name.replace("{node}", &self.name).replace("{ns}", self.namespace.trim_matches('/'));
+        let namespace = self.namespace.trim_end_matches('/');
+        let substituted =
+            name.replace("{node}", &self.name).replace("{ns}", namespace).replace("{namespace}", namespace);
         let full_name = match substituted.as_str() {
             "~" => self.full_name(),
             s if s.starts_with("~/") => join(&self.full_name(), &s[2..]),
@@ -361,8 +363,6 @@ fn check_token(token: &str, given: &str) -> Result<(), ArgsError> {
         Some(_) if !token.chars().all(|c| c.is_ascii_alphanumeric() || c == '_') => {
             rule("may hold letters, digits, '_' and '/' alone")
         }
-        // DDS keeps names with `__` to itself.
-        Some(_) if token.contains("__") => rule("must not hold '__'"),
         Some(_) => Ok(()),
     }
 }
@@ -617,6 +617,9 @@ mod tests {
             ("pieces/image", "/cell/cut/image"),
             ("/tf_static", "/tf_static"),
             ("{node}/x", "/cell/eye/x"),
+            ("{ns}/x", "/cell/x"),
+            ("{namespace}/{node}/x", "/cell/eye/x"),
+            ("/cam__0/image", "/cam__0/image"),
             ("capture", "/cell/capture"),
         ] {
             assert_eq!(node.topic(name).unwrap(), resolved, "{name}");

@@ -37,6 +37,8 @@ struct Logger {
 
 /// The lines of a node: those of the module it is named after, or all of them where it is alone.
 struct NodeLogger {
+    /// As in ROS: the full name of the node, with dots.
+    name: String,
     module: String,
     /// Asked for by name.
     level: Option<LevelFilter>,
@@ -64,13 +66,13 @@ impl Log for Logger {
             console.log(record);
         }
         if self.to_rosout(level, record.metadata())
-            && let Some(handle) =
-                node_of(nodes, record.target()).or(nodes.first()).and_then(|node| node.rosout.as_ref())
+            && let Some(node) = node_of(nodes, record.target()).or(nodes.first())
+            && let Some(handle) = &node.rosout
         {
             handle.rosout_raw(
                 Time::now(),
                 rosout_level(record.level()),
-                handle.base_name(),
+                &node.name,
                 &record.args().to_string(),
                 record.file().unwrap_or_default(),
                 "",
@@ -115,11 +117,16 @@ impl Logger {
     }
 }
 
+/// The name of a node's logger.
+fn logger_name(names: &NodeNames) -> String {
+    names.full_name().trim_start_matches('/').replace('/', ".")
+}
+
 /// The level that was asked for by one of the names of a node's logger: as in ROS the full name, with dots, or the
 /// beginning of it; its own name without the namespace, and that of its module. The longest of them counts, and of equal
 /// ones the last.
 fn level_of(levels: &[(String, LevelFilter)], names: &NodeNames, module: &str) -> Option<LevelFilter> {
-    let full_name = names.full_name().trim_start_matches('/').replace('/', ".");
+    let full_name = logger_name(names);
     let names_it = |name: &str| {
         let begins = full_name.strip_prefix(name).is_some_and(|rest| rest.is_empty() || rest.starts_with('.'));
         begins || name == names.name() || name == module
@@ -178,7 +185,7 @@ pub fn add_node(program: &str, names: &NodeNames) {
     if let Some(logger) = LOGGER.get() {
         let module = program.trim_end_matches("_node").to_owned();
         let level = level_of(&logger.levels, names, &module);
-        logger.nodes().push(NodeLogger { module, level, rosout: None });
+        logger.nodes().push(NodeLogger { name: logger_name(names), module, level, rosout: None });
     }
 }
 

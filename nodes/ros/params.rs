@@ -208,7 +208,7 @@ impl Parameters {
     }
 
     /// Takes over the values of the command line and of parameter files. A whole number is taken for a `double`, and a
-    /// number for a `string`, because YAML can't tell what was meant.
+    /// number for a `string`, because YAML can't tell what was meant; `yes` and `off` for a `bool`, as in ROS.
     ///
     /// # Errors
     /// The first value that breaks a rule. Names that files give to all nodes alike are passed over where they are
@@ -420,6 +420,12 @@ fn coerce(value: &ParameterValue, wanted: Default) -> ParameterValue {
         (ParameterValue::Integer(_) | ParameterValue::Double(_) | ParameterValue::Boolean(_), Default::Text(_)) => {
             ParameterValue::String(show(value))
         }
+        // The words of YAML 1.1, which ROS goes by, that YAML 1.2 has no more.
+        (ParameterValue::String(s), Default::Bool(_)) => match s.as_str() {
+            "y" | "Y" | "yes" | "Yes" | "YES" | "on" | "On" | "ON" => ParameterValue::Boolean(true),
+            "n" | "N" | "no" | "No" | "NO" | "off" | "Off" | "OFF" => ParameterValue::Boolean(false),
+            _ => value.clone(),
+        },
         _ => value.clone(),
     }
 }
@@ -452,7 +458,15 @@ mod tests {
         description: "Mode.",
         read_only: true,
     };
-    const TABLE: &[Spec] = &[SCALE, COUNT, MODE];
+    const SWITCH: Spec = Spec {
+        name: "switch",
+        default: Default::Bool(false),
+        unit: "",
+        rule: Rule::Any,
+        description: "Switch.",
+        read_only: false,
+    };
+    const TABLE: &[Spec] = &[SCALE, COUNT, MODE, SWITCH];
 
     fn given(name: &str, value: ParameterValue, addressed: bool) -> Override {
         Override { name: name.to_owned(), value, addressed }
@@ -466,7 +480,7 @@ mod tests {
             ("scale", ParameterValue::String("x".into()), "\"x\" is of type string, wanted is double"),
             ("count", ParameterValue::Integer(0), "0 breaks the rule: 1 to 9"),
             ("mode", ParameterValue::String("c".into()), "one of a, b"),
-            ("mod", ParameterValue::String("a".into()), "'mod' is unknown to n; it has: scale, count, mode"),
+            ("mod", ParameterValue::String("a".into()), "'mod' is unknown to n; it has: scale, count, mode, switch"),
         ];
         for (name, value, said) in cases {
             let message =
@@ -482,6 +496,11 @@ mod tests {
             ])
             .unwrap();
         assert_eq!((parameters.double(&SCALE), parameters.text(&MODE)), (1.0, "b".to_owned()));
+        for (word, meant) in [("yes", true), ("Off", false), ("ON", true), ("n", false)] {
+            parameters.start_with(&[given("switch", ParameterValue::String(word.into()), true)]).unwrap();
+            assert_eq!(parameters.bool(&SWITCH), meant, "{word}");
+        }
+        assert!(parameters.start_with(&[given("switch", ParameterValue::String("maybe".into()), true)]).is_err());
     }
 
     #[test]

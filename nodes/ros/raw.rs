@@ -25,7 +25,7 @@ const HEADER_LEN: usize = 4;
 const CHANNEL_DEPTH: usize = 16;
 
 /// Prefix of the DDS names of ROS topics.
-const TOPIC_PREFIX: &str = "rt";
+pub(super) const TOPIC_PREFIX: &str = "rt";
 
 /// Prefix that DDS puts before the name of a ROS message type, after its package.
 const DDS_TYPE_PART: &str = "::msg::dds_::";

@@ -12,7 +12,7 @@ use futures::channel::{mpsc, oneshot};
 use futures::{SinkExt, StreamExt};
 use jigsaw_msgs::builtin_interfaces::msg::Time;
 use jigsaw_msgs::{Message, Service};
-use ros2_client::{Context, MessageInfo, MessageTypeName, Name, Node, QosProfile, Subscription};
+use ros2_client::{Context, MessageInfo, MessageTypeName, Node, QosProfile, Subscription};
 use rustdds::{GUID, RTPSEntity};
 
 use super::activity::Activity;
@@ -20,6 +20,7 @@ use super::args::{ArgsError, NodeNames};
 use super::discovery::{Audience, Endpoints, LesserWriter, Offer};
 use super::health::Health;
 use super::params::Parameters;
+use super::raw::TOPIC_PREFIX;
 use super::topics::Topic;
 
 /// Messages that may wait between the middleware and a node's loop. Few: what waits further out waits in the
@@ -266,7 +267,7 @@ impl Session {
     /// # Errors
     /// A bad name.
     pub fn writers_of<M>(&self, topic: &Topic<M>) -> Result<impl Fn() -> Vec<GUID> + use<M>, SessionError> {
-        let name = format!("rt{}", self.names.topic(topic.name)?);
+        let name = format!("{TOPIC_PREFIX}{}", self.names.topic(topic.name)?);
         let participant = self.context.domain_participant().clone();
         let own = participant.guid().prefix;
         Ok(move || {
@@ -283,9 +284,8 @@ impl Session {
         let name = self.names.topic(topic.name)?;
         let type_name = MessageTypeName::new(M::TYPE.package, M::TYPE.name);
         let dds_topic = self
-            .node
-            .borrow()
-            .create_topic(&dds_name(&name)?, type_name, &topic.qos)
+            .context
+            .create_topic(format!("{TOPIC_PREFIX}{name}"), type_name, &topic.qos)
             .map_err(|e| SessionError::middleware(format!("topic {name}"), e))?;
         Ok((name, dds_topic))
     }
@@ -336,9 +336,4 @@ async fn hand_on<M: Message, T>(
             Err(e) => health.refuse("undecodable", &format!("message on {name} can't be decoded: {e}")),
         }
     }
-}
-
-/// An absolute name in the client library's form.
-pub(super) fn dds_name(name: &str) -> Result<Name, SessionError> {
-    Name::parse(name).map_err(|e| SessionError::middleware(format!("name {name}"), e))
 }

@@ -92,7 +92,7 @@ pub const TABLE_FRAME: Spec = Spec {
     name: "table_frame",
     default: Default::Text("table"),
     unit: "",
-    rule: Rule::Texts("a frame name: not empty, without blanks", is_frame_name),
+    rule: Rule::Texts("a frame name: not empty, without blanks, not beginning with '/'", is_frame_name),
     description: "Frame in which the pieces lie; origin at the centre of the picture, x right, y up, z to the camera.",
     read_only: true,
 };
@@ -102,7 +102,7 @@ pub const PUZZLE_FRAME: Spec = Spec {
     name: "puzzle_frame",
     default: Default::Text("puzzle"),
     unit: "",
-    rule: Rule::Texts("a frame name: not empty, without blanks", is_frame_name),
+    rule: Rule::Texts("a frame name: not empty, without blanks, not beginning with '/'", is_frame_name),
     description: "Frame in which the pieces belong; origin at the bottom left corner of the assembly.",
     read_only: true,
 };
@@ -137,7 +137,8 @@ pub const PARAMETERS: &[Spec] = &[
 ];
 
 fn is_frame_name(text: &str) -> bool {
-    !text.is_empty() && !text.chars().any(|c| c.is_whitespace() || c.is_control())
+    // tf2 knows no frame of a name that begins so.
+    !text.is_empty() && !text.starts_with('/') && !text.chars().any(|c| c.is_whitespace() || c.is_control())
 }
 
 /// The solver's own parameters.
@@ -170,6 +171,12 @@ mod tests {
     fn the_defaults_are_those_of_the_solver() {
         let parameters = Parameters::declare("n", &[PARAMETERS]);
         assert_eq!(solver_params(&parameters), Params::default());
+    }
+
+    #[test]
+    fn frames_have_names_that_tf2_knows() {
+        assert!(["table", "cell_1/table", "tisch_ä"].into_iter().all(is_frame_name));
+        assert!(!["", "light table", "/table"].into_iter().any(is_frame_name));
     }
 
     #[test]

@@ -75,12 +75,14 @@ def test_png_frames_namespace_and_remaps(launcher, ros, generate):
     launcher.cell(*SCALE, "-r", "__ns:=/lab", "-r", "image/compressed:=/overhead/compressed", "-r", "assembly:=/result")
     puzzle = generate(2, 3, 5)
     camera = Camera(ros, "/overhead/compressed", compressed=True, features="/lab/pieces/features")
-    arm = Arm(ros, assembly="/result")
+    arm, monitor = Arm(ros, assembly="/result"), Monitor(ros)
     truth = camera.show_puzzle(puzzle, make=compressed_message)
     check_assembly(arm, truth, arm.complete(6))
 
     names = {name for name, namespace in camera.node.get_node_names_and_namespaces() if namespace == "/lab"}
     assert names == {"capture_node", "feature_node", "solver_node"}
+    loggers = {f"lab.{name}" for name in names}
+    ros.until(lambda: {line.name for line in monitor.lines} == loggers, "lines of all loggers on /rosout")
     topics = dict(camera.node.get_topic_names_and_types())
     assert topics["/result"] == ["jigsaw_msgs/msg/Assembly"]
     assert topics["/lab/pieces/image"] == ["jigsaw_msgs/msg/PieceImage"]
