@@ -21,10 +21,6 @@ use ros2_client::{Context, MessageTypeName, Name, NodeName, NodeOptions};
 /// How long the secured cell may take; key exchange between all processes takes seconds.
 const PATIENCE: Duration = Duration::from_secs(45);
 
-/// How often a listener is started that hears nothing: with RustDDS 0.15 one secured process of some hundreds is not let in by
-/// one of the others, for as long as it lives, and its next life is.
-const LIVES: usize = 3;
-
 /// How long one listens that is to hear nothing: several times what an authorised one takes to hear the first thing.
 const SILENCE: Duration = Duration::from_secs(10);
 
@@ -89,10 +85,8 @@ impl Cell {
 
     /// Whether a listener of the cell gets the complete assembly.
     fn is_heard(&self) -> bool {
-        (0..LIVES).any(|_| {
-            let (status, out, _) = self.watch(Some("/cell"), PATIENCE, PIECES);
-            status.success() && out.join("assembly.json").is_file()
-        })
+        let (status, out, _) = self.watch(Some("/cell"), PATIENCE, PIECES);
+        status.success() && out.join("assembly.json").is_file()
     }
 }
 

@@ -1,27 +1,47 @@
-//! What discovery tells of the endpoints of this process: who listens, who asks for or offers too little, and who comes
-//! back after it was forgotten.
+//! What discovery tells of the endpoints of this process: who listens, who asks for or offers too little, who shakes
+//! hands, and who comes back after it was forgotten.
 
 use std::collections::{HashMap, HashSet, VecDeque};
 use std::sync::{Arc, Mutex, PoisonError};
+use std::time::{Duration, Instant};
 
 use futures::StreamExt;
 use futures::channel::mpsc;
 use ros2_client::QosProfile;
 use rustdds::dds::statusevents::{DomainParticipantStatusEvent, LostReason, StatusEvented};
 use rustdds::policy::{Durability, Reliability};
-use rustdds::{DomainParticipant, GUID, QosPolicies};
+use rustdds::{DomainParticipant, GUID, QosPolicies, RTPSEntity};
 
 use super::missed;
 
 /// Most participants that are remembered as forgotten; beyond, those that have been away longest are not expected back.
 const MOST_FORGOTTEN: usize = 1024;
 
-/// One that was forgotten has come back.
+/// How long shaking hands may take: longer than the lease, so that one that has died meanwhile has been forgotten.
+/// RustDDS tries for some 20 s.
+const HANDSHAKE_PATIENCE: Duration = Duration::from_secs(60);
+
+/// How often is looked for handshakes that take longer.
+const LOOK: Duration = Duration::from_secs(1);
+
+/// How long after its start a process is one that joins: what it has not been let in by it can be as a new one.
+const JOINING: Duration = Duration::from_secs(10);
+
+/// This process and another one can't hear each other, and could if this one were started again.
 #[derive(Debug, thiserror::Error)]
-#[error(
-    "participant {0} was away for longer than its lease and has come back, and the middleware can't find its topics again; start this node again"
-)]
-pub struct Estranged(String);
+pub enum Estranged {
+    /// One that was forgotten has come back.
+    #[error(
+        "participant {0} was away for longer than its lease and has come back, and the middleware can't find its topics again; start this node again"
+    )]
+    CameBack(String),
+    /// One is there, and neither lets this process in nor turns it away.
+    #[error(
+        "participant {0} has not finished its handshake with this one in {n} s, so that neither hears the other; start one of them again",
+        n = HANDSHAKE_PATIENCE.as_secs()
+    )]
+    NotLetIn(String),
+}
 
 /// What discovery has told of the endpoints of this process.
 #[derive(Debug, Clone, Default)]
@@ -33,6 +53,7 @@ struct EndpointTable {
     requests: HashSet<GUID>,
     readers_of: HashMap<GUID, HashSet<GUID>>,
     lesser_writers: HashMap<GUID, mpsc::UnboundedSender<LesserWriter>>,
+    handshakes: HashMap<GUID, Instant>,
 }
 
 /// A writer that offers less than a reader asks for.
@@ -121,6 +142,20 @@ impl Endpoints {
         Audience { endpoints: self.clone(), writer }
     }
 
+    /// With how many participants this one is shaking hands: they have been met, and are not yet let in or turned away.
+    pub(super) fn handshakes(&self) -> usize {
+        self.with(|table| table.handshakes.len())
+    }
+
+    /// One that takes too long to shake hands, and since when; it is not told of again.
+    fn take_overdue_handshake(&self) -> Option<(GUID, Instant)> {
+        self.with(|table| {
+            let overdue = table.handshakes.iter().find(|(_, since)| since.elapsed() > HANDSHAKE_PATIENCE);
+            let id = *overdue?.0;
+            table.handshakes.remove_entry(&id)
+        })
+    }
+
     /// The name of the topic of an endpoint of this process.
     fn name(&self, endpoint: GUID) -> Option<String> {
         self.with(|table| table.names.get(&endpoint).cloned())
@@ -146,8 +181,8 @@ impl Audience {
     }
 }
 
-/// Keeps account of who listens, and warns of those who would but can't. Resolves when one that was forgotten comes back,
-/// if this process is started again then; otherwise that is a warning, too.
+/// Keeps account of who listens, and warns of those who would but can't. Resolves when this process and another one can't
+/// hear each other and it is for this one to be started again; otherwise that is a warning, too.
 pub(super) async fn follow(
     participant: Option<DomainParticipant>,
     endpoints: Endpoints,
@@ -155,9 +190,28 @@ pub(super) async fn follow(
 ) -> Estranged {
     let Some(participant) = participant else { return std::future::pending().await };
     let mut forgotten = VecDeque::new();
+    let start = Instant::now();
+    // Of a participant's id the middleware sometimes tells the prefix alone.
+    let whole_id = |prefix| GUID { prefix, ..participant.guid() };
     let listener = participant.status_listener();
     let mut events = listener.as_async_status_stream();
-    while let Some(event) = events.next().await {
+    let mut looks = smol::Timer::interval(LOOK).fuse();
+    loop {
+        let event = futures::select! {
+            event = events.next() => event,
+            _ = looks.next() => {
+                if let Some((id, since)) = endpoints.take_overdue_handshake() {
+                    let error = Estranged::NotLetIn(format!("{:?}", id.prefix));
+                    if started_again && since < start + JOINING {
+                        return error;
+                    }
+                    log::warn!("{error}");
+                }
+                continue;
+            }
+        };
+        // Without events the participant is about to go.
+        let Some(event) = event else { return std::future::pending().await };
         match event {
             DomainParticipantStatusEvent::RemoteReaderMatched { local_writer, remote_reader } => {
                 endpoints.matched(local_writer, remote_reader);
@@ -172,6 +226,7 @@ pub(super) async fn follow(
             DomainParticipantStatusEvent::ReaderLost { guid, .. } => endpoints.lost(guid),
             DomainParticipantStatusEvent::ParticipantLost { id, reason } => {
                 endpoints.lost_all(|reader| reader.prefix == id);
+                endpoints.with(|table| table.handshakes.remove(&whole_id(id)));
                 if matches!(reason, LostReason::Timeout { .. }) {
                     forgotten.truncate(MOST_FORGOTTEN - 1);
                     forgotten.push_front(id);
@@ -179,7 +234,7 @@ pub(super) async fn follow(
             }
             DomainParticipantStatusEvent::ParticipantDiscovered { dpd } if forgotten.contains(&dpd.guid.prefix) => {
                 forgotten.retain(|id| *id != dpd.guid.prefix);
-                let error = Estranged(format!("{:?}", dpd.guid.prefix));
+                let error = Estranged::CameBack(format!("{:?}", dpd.guid.prefix));
                 if started_again {
                     return error;
                 }
@@ -199,11 +254,18 @@ pub(super) async fn follow(
             } if !endpoints.tell_of_lesser(local, remote_writer, &offered_qos) => {
                 warn_of_incompatible(&endpoints, local, "publisher", &requested_qos, &offered_qos);
             }
+            #[cfg(feature = "security")]
+            DomainParticipantStatusEvent::Authentication { participant, status } => {
+                let other = whole_id(participant);
+                endpoints.with(|table| match format!("{status:?}").as_str() {
+                    // The middleware doesn't give out the type of this.
+                    "Authenticating" => table.handshakes.insert(other, Instant::now()),
+                    _ => table.handshakes.remove(&other),
+                });
+            }
             _ => {}
         }
     }
-    // The participant is about to go.
-    std::future::pending().await
 }
 
 fn warn_of_incompatible(

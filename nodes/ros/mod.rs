@@ -22,7 +22,7 @@
 //! | [`kept`] | latched pieces, and which of them are forgotten |
 //! | [`peers`] | discovery without multicast |
 //! | `farewell` | says that a process leaves |
-//! | `turn` | the processes of a host open their endpoints one after the other |
+//! | `turn` | the processes of a host join a domain one after the other |
 //! | [`process`] | one process: signals, participant, watchdog, exit code |
 //! | [`logging`] | log lines to the console and `/rosout`, throttled warnings |
 //! | [`health`] | counters of a node, published as `/diagnostics` |

@@ -247,7 +247,7 @@ pub struct Process {
     executor: Rc<smol::LocalExecutor<'static>>,
     endpoints: Endpoints,
     participant: Option<(DomainParticipant, Context)>,
-    /// Held until the endpoints are open.
+    /// Held until this process has joined the domain.
     turn: Option<Turn>,
     /// Said at the end.
     farewell: Option<Farewell>,
@@ -369,7 +369,8 @@ impl Process {
         let participant = self.participant.as_ref().map(|(participant, _)| participant.clone());
         let discovery = discovery::follow(participant, self.endpoints.clone(), self.started_again);
         if let Some(turn) = self.turn.take() {
-            self.executor.spawn(turn.done()).detach();
+            let endpoints = self.endpoints.clone();
+            self.executor.spawn(turn.done(move || endpoints.handshakes())).detach();
         }
         log::info!("{} is ready", self.name);
         let executor = Rc::clone(&self.executor);
@@ -453,24 +454,23 @@ impl Process {
             log::debug!("network interfaces: {addresses:?}");
             builder = builder.with_only_networks(addresses.iter().copied());
         }
-        let mut is_secured = false;
-        if let Some(enclave) = security::enclave(self.args.enclave.as_deref(), |variable| std::env::var(variable).ok())?
-        {
+        let enclave = security::enclave(self.args.enclave.as_deref(), |variable| std::env::var(variable).ok())?;
+        let is_secured = enclave.is_some();
+        if let Some(enclave) = enclave {
             builder = secured(builder, &enclave);
-            is_secured = true;
         }
         let peers = static_peers(parameters, std::env::var("ROS_STATIC_PEERS").ok())?;
         let system = |e: std::io::Error| ProcessError::System { what: "listening to discovery", reason: e.to_string() };
         // Opened before the participant, so that its first announcement is heard.
         let courier =
             if peers.is_empty() { None } else { Some(peers::Courier::open(domain, &addresses).map_err(system)?) };
+        self.turn = Some(Turn::take(domain, is_secured));
         let participant = builder.build().map_err(|e| SessionError::middleware(format!("DDS domain {domain}"), e))?;
         if let Some(courier) = courier {
             log::debug!("static peers: {peers:?}");
             courier.serve(participant.guid(), peers.clone()).map_err(system)?;
         }
         self.farewell = (!is_secured).then(|| Farewell::of(participant.guid(), domain, addresses, peers));
-        self.turn = Some(Turn::take(domain));
         let context = Context::from_domain_participant(participant.clone())
             .map_err(|e| SessionError::middleware(format!("DDS domain {domain}"), e))?;
         self.participant = Some((participant, context.clone()));

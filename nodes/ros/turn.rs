@@ -1,12 +1,18 @@
-//! Opening endpoints one process after the other.
+//! Joining a domain one process after the other.
 //!
-//! Fast DDS (3.2, the usual middleware of ROS 2) keeps announcements of endpoints that it can't use yet, because an
+//! **For the sake of Fast DDS.** Fast DDS (3.2, the usual middleware of ROS 2) keeps announcements of endpoints that it can't use yet, because an
 //! earlier one of the same participant is missing, in one list for all participants, ordered by number within a
 //! participant and by time between them. RustDDS puts no time on its announcements, and where such are waiting of *two*
 //! participants the order breaks: what fills the gap is put behind later numbers, not found there, and forgotten for
 //! good although it is acknowledged. An rclpy node that starts together with several of our processes would never see
 //! some of their topics, services or names. Announcements wait only of a participant that is met while it opens its
 //! endpoints. So the processes of a host open theirs one after the other.
+//!
+//! **For the sake of DDS Security.** RustDDS 0.15 reads the handshakes of all participants through a history of one message, and each
+//! participant sends its own to all, again and again in one go. Where several join together each overwrites what the
+//! others said, on a busy machine in the same order every second until they give up after ten, and the two do not hear each
+//! other until they have forgotten one another. Of one that joins alone at least one handshake gets through at
+//! a time. So a secured process has its turn until all whom it met have let it in.
 
 use std::fs::{File, OpenOptions, TryLockError};
 use std::time::{Duration, Instant};
@@ -19,20 +25,30 @@ const ECHO: Duration = Duration::from_millis(100);
 /// stopped.
 const PATIENCE: Duration = Duration::from_secs(3);
 
+/// The same where processes are secured; less than a loop may stand still (`LOOKS` of [`super::process`]).
+const SECURED_PATIENCE: Duration = Duration::from_secs(20);
+
+/// How long a secured process waits to be met: by then the others have heard its announcement and answered with theirs, on a
+/// busy machine as well.
+const ENCOUNTER: Duration = Duration::from_millis(500);
+
+/// How long it waits to be let in: RustDDS sends a handshake ten times, every second.
+const HANDSHAKES: Duration = Duration::from_secs(12);
+
 /// How often is looked whether the turn has come.
 const LOOK: Duration = Duration::from_millis(5);
 
-/// The turn of this process among those of its host in its domain; given back [`ECHO`] after [`Self::done`], or when
-/// this is dropped.
+/// The turn of this process among those of its host in its domain; given back when this is dropped.
 #[derive(Debug)]
 pub(super) struct Turn {
     lock: Option<File>,
+    secured: bool,
 }
 
 impl Turn {
     /// Waits for the turn. Where it does not come, or the system knows no such lock, there is none, and nothing is lost
     /// but certainty.
-    pub(super) fn take(domain: u16) -> Self {
+    pub(super) fn take(domain: u16, secured: bool) -> Self {
         let path = std::env::temp_dir().join(format!("jigsaw_cell_domain_{domain}.turn"));
         // A file of another user can be locked as well; it need only be readable.
         let file = File::open(&path).or_else(|_| OpenOptions::new().append(true).create(true).open(&path));
@@ -40,45 +56,71 @@ impl Turn {
             Ok(file) => file,
             Err(e) => {
                 log::debug!("endpoints are opened without waiting for other processes: {}: {e}", path.display());
-                return Self { lock: None };
+                return Self { lock: None, secured };
             }
         };
-        let end = Instant::now() + PATIENCE;
+        let end = Instant::now() + if secured { SECURED_PATIENCE } else { PATIENCE };
         loop {
             match file.try_lock() {
-                Ok(()) => return Self { lock: Some(file) },
+                Ok(()) => return Self { lock: Some(file), secured },
                 Err(TryLockError::WouldBlock) if Instant::now() < end => std::thread::sleep(LOOK),
-                Err(_) => return Self { lock: None },
+                Err(_) => return Self { lock: None, secured },
             }
         }
     }
 
-    /// Says that the endpoints are open.
-    pub(super) async fn done(self) {
-        if self.lock.is_some() {
-            smol::Timer::after(ECHO).await;
+    /// To be called when the endpoints are open: gives the turn back when others may join. `handshakes` tells with how many
+    /// participants this one is shaking hands.
+    pub(super) async fn done(self, handshakes: impl Fn() -> usize) {
+        if self.lock.is_none() {
+            return;
         }
+        if self.secured {
+            let end = Instant::now() + HANDSHAKES;
+            smol::Timer::after(ENCOUNTER).await;
+            while handshakes() > 0 && Instant::now() < end {
+                smol::Timer::after(LOOK).await;
+            }
+        }
+        smol::Timer::after(ECHO).await;
     }
 }
 
 #[cfg(test)]
 mod tests {
+    use std::cell::Cell;
+
     use super::*;
 
-    /// A domain that no test runs a node in.
+    /// Domains that no test runs a node in.
     const DOMAIN: u16 = 231;
+    const SECURED_DOMAIN: u16 = 232;
 
-    #[test]
-    fn a_turn_is_given_on() {
-        let first = Turn::take(DOMAIN);
+    /// When the next one had its turn, after the first was done under these circumstances.
+    fn next_turn(domain: u16, secured: bool, handshakes: impl Fn() -> usize) -> Duration {
+        let first = Turn::take(domain, secured);
         assert!(first.lock.is_some());
-        let next = std::thread::spawn(|| {
-            let turn = Turn::take(DOMAIN);
+        let next = std::thread::spawn(move || {
+            let turn = Turn::take(domain, secured);
             (turn.lock.is_some(), Instant::now())
         });
         let opened = Instant::now();
-        smol::block_on(first.done());
+        smol::block_on(first.done(handshakes));
         let (has, taken) = next.join().expect("the thread ends");
-        assert!(has && taken >= opened + ECHO, "the turn was taken {:?} after the endpoints were open", taken - opened);
+        assert!(has, "the turn was not given back");
+        taken - opened
+    }
+
+    #[test]
+    fn a_turn_is_given_on() {
+        assert!(next_turn(DOMAIN, false, || usize::MAX) >= ECHO);
+    }
+
+    #[test]
+    fn a_secured_turn_lasts_until_all_have_let_it_in() {
+        let left = Cell::new(5_usize);
+        let handshakes = || left.replace(left.get().saturating_sub(1));
+        assert!(next_turn(SECURED_DOMAIN, true, handshakes) >= ENCOUNTER);
+        assert_eq!(left.get(), 0);
     }
 }
