@@ -49,6 +49,11 @@ pub fn camera(topic: &str) -> &str {
     topic.strip_suffix("/compressed").unwrap_or(topic)
 }
 
+/// The names of the pieces of a frame: its own of a single one, with a number of several.
+fn piece_ids(base: &str, count: usize) -> impl Iterator<Item = String> {
+    (0..count).map(move |k| if count == 1 { base.to_owned() } else { format!("{base}_{k}") })
+}
+
 fn stem(file: &str) -> &str {
     file.rsplit_once('.').map_or(file, |(stem, _)| stem)
 }
@@ -80,6 +85,7 @@ pub struct Known {
     /// By their keys: hash of the content, names of the pieces.
     frames: HashMap<String, Vec<(u64, Vec<String>)>>,
     frame_order: VecDeque<String>,
+    /// Which file a piece is of, by the piece's name.
     files: HashMap<String, String>,
     places: VecDeque<Place>,
 }
@@ -110,21 +116,17 @@ impl Known {
             base = format!("{base}_{content:016x}");
         }
         if let FrameName::File(name) = frame {
-            match self.files.get(&base) {
-                Some(other) if other != name => base = plain(name),
-                _ => {}
+            let is_other = |id: String| self.files.get(&id).is_some_and(|other| other != name);
+            if piece_ids(&base, cutouts.len()).any(is_other) {
+                base = plain(name);
             }
-            self.files.insert(base.clone(), name.clone());
+            self.files.extend(piece_ids(&base, cutouts.len()).map(|id| (id, name.clone())));
         }
-        let admissions: Vec<Admission> = cutouts
-            .iter()
-            .enumerate()
-            .map(|(k, cutout)| {
-                let id = if cutouts.len() == 1 { base.clone() } else { format!("{base}_{k}") };
-                match frame {
-                    FrameName::File(_) => Admission { id, publish: true },
-                    FrameName::Stamp(source, ..) => self.admit_place(source, id, cutout, overlap),
-                }
+        let admissions: Vec<Admission> = piece_ids(&base, cutouts.len())
+            .zip(cutouts)
+            .map(|(id, cutout)| match frame {
+                FrameName::File(_) => Admission { id, publish: true },
+                FrameName::Stamp(source, ..) => self.admit_place(source, id, cutout, overlap),
             })
             .collect();
         self.remember(frame, content, &admissions);
@@ -303,6 +305,10 @@ mod tests {
         let first = known.admit(&name("a.png"), 1, &[disc(100, 100, 40)], OVERLAP);
         let second = known.admit(&name("a.jpg"), 2, &[disc(100, 100, 40)], OVERLAP);
         assert_eq!((first[0].id.as_str(), second[0].id.as_str()), ("a", "a.jpg"));
+        // The second piece of one file would have the name of the only one of another.
+        known.admit(&name("scan.png"), 3, &[disc(100, 100, 40), disc(300, 100, 40)], OVERLAP);
+        let only = known.admit(&name("scan_1.png"), 4, &[disc(100, 100, 40)], OVERLAP);
+        assert_eq!(ids(&only), [("scan_1.png", true)]);
     }
 
     #[test]

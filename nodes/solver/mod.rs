@@ -416,6 +416,10 @@ impl Table {
             let result = AssembleResult { complete: end == GoalEnd::Succeeded, assembly: self.best.clone() };
             // The client may have gone; that is no concern of the node.
             let _ = goal.finish.send((end, result));
+            // What was published last goes by the number of a goal that nobody pursues any more.
+            if end != GoalEnd::Succeeded && goal.expected_pieces > 0 && !self.sightings.is_empty() {
+                self.due = Some(Instant::now());
+            }
         }
     }
 

@@ -12,7 +12,7 @@ from jigsaw_msgs.msg import Assembly, PieceFeatures
 from rclpy.action import ActionClient
 from unique_identifier_msgs.msg import UUID
 
-from bench import SCALE, Camera
+from bench import SCALE, Arm, Camera
 from conftest import LATCHED
 
 ACKNOWLEDGEMENT = rclpy.duration.Duration(seconds=0.1)  # for which nothing else is done
@@ -119,6 +119,18 @@ def test_a_goal_is_called_off(launcher, client):
     assert client.cancel(handle).return_code == CancelGoal.Response.ERROR_GOAL_TERMINATED
     handle.goal_id.uuid[0] ^= 1
     assert client.cancel(handle).return_code == CancelGoal.Response.ERROR_UNKNOWN_GOAL_ID
+
+
+def test_a_goal_that_was_called_off_does_not_say_what_is_complete(launcher, ros, generate, client):
+    launcher.cell(*SCALE)
+    arm = Arm(ros)
+    Camera(ros).show_puzzle(generate(2, 3, 5))
+    arm.complete(6)
+    handle = client.send(expected_pieces=7)
+    assert handle.accepted
+    ros.until(lambda: arm.assemblies[-1].state == Assembly.PARTIAL, "assembly that is partial by the goal's number")
+    assert client.cancel(handle).return_code == CancelGoal.Response.ERROR_NONE
+    arm.complete(6)
 
 
 def test_one_goal_at_a_time(launcher, ros, client):
