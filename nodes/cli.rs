@@ -4,7 +4,7 @@
 //! stderr that says what is wrong.
 
 use std::ffi::OsString;
-use std::io::{IsTerminal, Write};
+use std::io::IsTerminal;
 use std::path::PathBuf;
 use std::process::ExitCode;
 use std::sync::Mutex;
@@ -16,6 +16,7 @@ use jigsaw::{Params, Policy};
 
 use crate::bag::cli::BagCommand;
 use crate::cell::CellArgs;
+use crate::console::{complain, say};
 use crate::offline::{self, OfflineError, Progress};
 use crate::watch::WatchArgs;
 
@@ -251,7 +252,7 @@ pub fn run(arguments: impl IntoIterator<Item = OsString>) -> ExitCode {
             return DONE.into();
         }
         Err(error) => {
-            complain(&usage_error(&error));
+            complain!("jigsaw: {}", usage_error(&error));
             return BAD_INPUT.into();
         }
     };
@@ -266,7 +267,7 @@ pub fn run(arguments: impl IntoIterator<Item = OsString>) -> ExitCode {
     match code {
         Ok(code) => code.into(),
         Err(error) => {
-            complain(&error.to_string());
+            complain!("jigsaw: {error}");
             BAD_INPUT.into()
         }
     }
@@ -281,10 +282,6 @@ enum CliError {
     Generate(#[from] generate::GenerateError),
     #[error(transparent)]
     Params(#[from] jigsaw::ParamsError),
-}
-
-fn complain(text: &str) {
-    let _ = writeln!(std::io::stderr(), "jigsaw: {text}");
 }
 
 /// The first paragraph of clap's message on one line, and where to read on.
@@ -417,8 +414,7 @@ impl Display {
     /// A result on stdout.
     fn say(&self, text: &str) {
         if !self.quiet {
-            // A closed pipe is no reason to fail.
-            let _ = writeln!(std::io::stdout(), "{text}");
+            say!("{text}");
         }
     }
 }
@@ -448,7 +444,7 @@ impl Progress for Display {
 
     fn warning(&self, text: &str) {
         self.bar().suspend(|| {
-            let _ = writeln!(std::io::stderr(), "warning: {text}");
+            complain!("warning: {text}");
         });
     }
 }

@@ -8,6 +8,7 @@ pub mod bag;
 pub mod capture;
 pub mod cell;
 pub mod cli;
+mod console;
 pub mod feature;
 pub mod offline;
 pub mod picture;

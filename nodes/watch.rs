@@ -21,6 +21,7 @@ use jigsaw_msgs::sensor_msgs::msg::Image;
 use nalgebra::{Isometry2, Point2, Vector2};
 use serde_json::{Value, json};
 
+use crate::console::{complain, say};
 use crate::ros::process::{Process, exit_code};
 use crate::ros::session::{Session, SessionError};
 use crate::ros::topics;
@@ -79,7 +80,7 @@ const PICTURE_PATIENCE: Duration = Duration::from_secs(2);
 #[must_use]
 pub fn run(args: WatchArgs) -> ExitCode {
     let Ok(timeout) = Duration::try_from_secs_f64(args.timeout) else {
-        eprintln!("jigsaw watch: --timeout {}: must be 0 or a positive number of seconds", args.timeout);
+        complain!("jigsaw watch: --timeout {}: must be 0 or a positive number of seconds", args.timeout);
         return ExitCode::from(BAD_INPUT);
     };
     let ros = std::iter::once("--ros-args".to_owned()).chain(args.ros_args);
@@ -110,20 +111,20 @@ pub fn run(args: WatchArgs) -> ExitCode {
         return exit_code("jigsaw watch", Err(error));
     }
     if ended.get() {
-        eprintln!("jigsaw watch: not complete after {} s", args.timeout);
+        complain!("jigsaw watch: not complete after {} s", args.timeout);
     }
     let heard = heard.borrow();
     let Some(assembly) = &heard.assembly else {
-        eprintln!("jigsaw watch: no assembly was published; do the nodes run, and in the same ROS_DOMAIN_ID?");
+        complain!("jigsaw watch: no assembly was published; do the nodes run, and in the same ROS_DOMAIN_ID?");
         return ExitCode::from(INCOMPLETE);
     };
-    print!("{}", table(assembly, pieces));
+    say!("{}", table(assembly, pieces).trim_end());
     if let Err(error) = write(&args.out, assembly, &heard) {
-        eprintln!("jigsaw watch: {}: {error}", args.out.display());
+        complain!("jigsaw watch: {}: {error}", args.out.display());
         return ExitCode::from(BAD_INPUT);
     }
     if heard.picture.is_none() {
-        eprintln!("jigsaw watch: no picture was published on assembly/image");
+        complain!("jigsaw watch: no picture was published on assembly/image");
     }
     ExitCode::from(if heard.is_complete(pieces) { 0 } else { INCOMPLETE })
 }

@@ -39,6 +39,23 @@ fn stderr_lines(output: &Output) -> Vec<String> {
     String::from_utf8(output.stderr.clone()).unwrap().lines().map(str::to_owned).collect()
 }
 
+#[test]
+fn streams_that_nobody_reads_are_no_fault() {
+    let full = || fs::OpenOptions::new().write(true).open("/dev/full").unwrap();
+    let (node, jigsaw) = (env!("CARGO_BIN_EXE_capture_node"), env!("CARGO_BIN_EXE_jigsaw"));
+    for (program, arguments, code) in [
+        (node, &["--help"][..], 0),
+        (node, &["--version"], 0),
+        (node, &["--no-such-option"], 2),
+        (jigsaw, &["--help"], 0),
+        (jigsaw, &["bag", "info", "/no/such/bag"], 2),
+        (jigsaw, &["watch", "--out", "x", "--timeout", "nan"], 2),
+    ] {
+        let status = Command::new(program).args(arguments).stdout(full()).stderr(full()).status().unwrap();
+        assert_eq!(status.code(), Some(code), "{program} {arguments:?}");
+    }
+}
+
 /// Makes a puzzle with the given options in `folder`.
 fn generate(folder: &Path, options: &[&str]) -> Value {
     let output = jigsaw(&[&["generate", "--out", text(folder)], options].concat());

@@ -15,6 +15,7 @@ use super::play::{PlayEvent, PlayOptions, play};
 use super::qos::{Durability, QosProfile, Reliability};
 use super::record::{RecordError, RecordEvent, RecordOptions, RequestedTopic, record};
 use super::{BagReader, BagWriter, Compression, Storage, WriterOptions};
+use crate::console::{complain, say};
 use crate::ros::process::{Process, ProcessError, exit_code};
 
 /// Exit code for bad input.
@@ -171,14 +172,14 @@ pub fn run(command: BagCommand) -> ExitCode {
 }
 
 fn bad_input(error: impl std::fmt::Display) -> ExitCode {
-    eprintln!("jigsaw bag: {error}");
+    complain!("jigsaw bag: {error}");
     ExitCode::from(BAD_INPUT)
 }
 
 fn open(path: &std::path::Path) -> Result<BagReader, ExitCode> {
     let bag = BagReader::open(path).map_err(bad_input)?;
     for warning in bag.warnings() {
-        eprintln!("jigsaw bag: warning: {warning}");
+        complain!("jigsaw bag: warning: {warning}");
     }
     Ok(bag)
 }
@@ -298,14 +299,14 @@ fn run_play(args: PlayArgs) -> ExitCode {
                 match result {
                     Ok(report) => {
                         for (port, drops) in &report.drops {
-                            eprintln!(
+                            complain!(
                                 "jigsaw bag: warning: the system dropped {drops} datagrams for the process at UDP port \
                                  {port}; raise net.core.rmem_max or the rate's inverse (--rate 1)"
                             );
                         }
                         let skipped =
                             if report.skipped > 0 { format!(", {} left out", report.skipped) } else { String::new() };
-                        println!("{} messages played{skipped}", report.sent);
+                        say!("{} messages played{skipped}", report.sent);
                     }
                     Err(error) => outcome.set(bad_input(error)),
                 }
@@ -327,7 +328,7 @@ fn bar() -> ProgressBar {
 fn show_play(bar: &ProgressBar, event: PlayEvent) {
     match event {
         PlayEvent::Waiting(topics) => {
-            bar.suspend(|| eprintln!("jigsaw bag: waiting for a subscription of {}", topics.join(", ")));
+            bar.suspend(|| complain!("jigsaw bag: waiting for a subscription of {}", topics.join(", ")));
         }
         PlayEvent::Started { messages } => bar.set_length(messages),
         PlayEvent::Sent(sent) => {
@@ -335,7 +336,7 @@ fn show_play(bar: &ProgressBar, event: PlayEvent) {
             let length = bar.length().unwrap_or(sent).max(1);
             bar.set_position((sent - 1) % length + 1);
         }
-        PlayEvent::Warning(text) => bar.suspend(|| eprintln!("jigsaw bag: warning: {text}")),
+        PlayEvent::Warning(text) => bar.suspend(|| complain!("jigsaw bag: warning: {text}")),
     }
 }
 
@@ -380,7 +381,7 @@ fn run_record(args: RecordArgs) -> ExitCode {
                 Ok(()) => bag.finish(),
             };
             match finished {
-                Ok(()) => println!("{count} messages recorded in {}", args.bag.display()),
+                Ok(()) => say!("{count} messages recorded in {}", args.bag.display()),
                 Err(error) => outcome.set(bad_input(error)),
             }
             Ok(())
@@ -395,9 +396,9 @@ fn run_record(args: RecordArgs) -> ExitCode {
 fn show_record(spinner: &ProgressBar, event: RecordEvent) {
     match event {
         RecordEvent::Subscribed { topic, type_name } => {
-            spinner.suspend(|| eprintln!("jigsaw bag: recording {topic} [{type_name}]"));
+            spinner.suspend(|| complain!("jigsaw bag: recording {topic} [{type_name}]"));
         }
-        RecordEvent::Warning(text) => spinner.suspend(|| eprintln!("jigsaw bag: {text}")),
+        RecordEvent::Warning(text) => spinner.suspend(|| complain!("jigsaw bag: {text}")),
         RecordEvent::Recorded(count) => {
             spinner.set_message(format!("{count} messages"));
             spinner.tick();

@@ -48,6 +48,7 @@ use super::params::{Default as DefaultValue, ParameterError, Parameters, Rule, S
 use super::session::{Clock, Session, SessionError};
 use super::turn::Turn;
 use super::{discovery, logging, peers, security, services, topics};
+use crate::console::{complain, say};
 
 /// Whether a node starts to work by itself.
 pub const AUTOSTART: Spec = Spec {
@@ -189,11 +190,11 @@ pub type Work = LocalBoxFuture<'static, Result<(), ProcessError>>;
 pub fn main(program: Program, open: impl FnOnce(Session) -> Result<Work, ProcessError>) -> ExitCode {
     let args: Vec<String> = std::env::args().skip(1).collect();
     if args.iter().any(|a| a == "--help" || a == "-h") {
-        println!("{}", help(&program));
+        say!("{}", help(&program));
         return ExitCode::SUCCESS;
     }
     if args.iter().any(|a| a == "--version" || a == "-V") {
-        println!("{} {}", program.name, env!("CARGO_PKG_VERSION"));
+        say!("{} {}", program.name, env!("CARGO_PKG_VERSION"));
         return ExitCode::SUCCESS;
     }
     let result = Process::start(program.name, args).and_then(|process| {
@@ -207,13 +208,13 @@ pub fn main(program: Program, open: impl FnOnce(Session) -> Result<Work, Process
 pub fn exit_code(program: &str, result: Result<(), ProcessError>) -> ExitCode {
     match result {
         Ok(()) => ExitCode::SUCCESS,
-        Err(error) => say(program, &error).into(),
+        Err(error) => told(program, &error).into(),
     }
 }
 
 /// Says what went wrong, and gives the exit code for it.
-fn say(program: &str, error: &ProcessError) -> u8 {
-    eprintln!("{program}: {error}");
+fn told(program: &str, error: &ProcessError) -> u8 {
+    complain!("{program}: {error}");
     error.exit_code()
 }
 
@@ -392,7 +393,7 @@ impl Process {
         if let Err(error @ ProcessError::Deaf(_)) = &result {
             // A dead participant can't be taken down in order; its drop would wait for the dead thread.
             leave();
-            std::process::exit(say(self.name, error).into());
+            std::process::exit(told(self.name, error).into());
         }
         // When nothing of it is left that could announce itself once more.
         let participant = self.participant.take();
@@ -433,7 +434,7 @@ impl Process {
                 looks = if now == last { looks + 1 } else { 0 };
                 last = now;
                 if looks > LOOKS {
-                    std::process::exit(say(name, &ProcessError::Stalled).into());
+                    std::process::exit(told(name, &ProcessError::Stalled).into());
                 }
                 drop(rounds);
                 std::thread::sleep(WATCH_PERIOD);
