@@ -30,15 +30,13 @@ use crate::bag::{BagError, BagReader, RawMessage, Selection, Storage, TopicCount
 use crate::capture::convert::{self, Picture, Pixels};
 use crate::capture::known::{FrameName, Known};
 use crate::capture::params::SAME_PLACE_OVERLAP;
-use crate::capture::source::Frame;
+use crate::capture::source::{Frame, PICTURE_ENDINGS};
 use crate::picture;
 
 /// Images segmented at once: bounds the memory for pixels, and keeps all threads busy.
 const BATCH: usize = 64;
 /// Samples of an isthmus distance function in `features.json`.
 const IDF_SAMPLES: usize = 64;
-/// File name extensions of images, in lower case.
-const IMAGE_EXTENSIONS: [&str; 9] = ["png", "jpg", "jpeg", "tif", "tiff", "bmp", "pgm", "ppm", "pnm"];
 /// Ending of the pictures that [`inspect`] writes.
 const OVERLAY_ENDING: &str = "_overlay.png";
 /// Types of the messages that are pictures.
@@ -62,7 +60,7 @@ pub enum OfflineError {
         error: io::Error,
     },
     /// A folder without an image.
-    #[error("{}: no image in this folder; expected files ending in .{}", path.display(), IMAGE_EXTENSIONS.join(", ."))]
+    #[error("{}: no image in this folder; expected files ending in .{}", path.display(), PICTURE_ENDINGS.join(", ."))]
     EmptyFolder {
         /// The folder.
         path: PathBuf,
@@ -421,7 +419,7 @@ fn find_inputs(paths: &[PathBuf], out: &Path, progress: &dyn Progress) -> Result
             let file = entry.map_err(read)?.path();
             let name = file.file_name().map(|n| n.to_string_lossy().into_owned()).unwrap_or_default();
             let written = own && (name == ASSEMBLY_PICTURE || name.ends_with(OVERLAY_ENDING));
-            let wanted = IMAGE_EXTENSIONS.contains(&extension(&file).as_str());
+            let wanted = PICTURE_ENDINGS.contains(&extension(&file).as_str());
             if wanted && !name.starts_with('.') && !written && file.is_file() {
                 files.push(file);
             }

@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use jigsaw_msgs::sensor_msgs::msg::{CompressedImage, Image};
 
 /// File name endings of pictures, in lower case.
-pub const PICTURE_ENDINGS: &[&str] = &["png", "jpg", "jpeg", "bmp", "tif", "tiff", "pgm", "ppm"];
+pub const PICTURE_ENDINGS: &[&str] = &["png", "jpg", "jpeg", "bmp", "tif", "tiff", "pbm", "pgm", "ppm", "pnm"];
 
 /// A frame as it comes in.
 #[derive(Debug, Clone)]
@@ -66,11 +66,11 @@ mod tests {
         std::fs::create_dir_all(&folder).unwrap();
         let error = pictures(&folder).unwrap_err().to_string();
         assert!(error.contains("no picture"), "{error}");
-        for name in ["b.PNG", "a.jpg", "notes.txt", "c"] {
+        for name in ["b.PNG", "a.jpg", "c.pnm", "notes.txt", "c"] {
             std::fs::write(folder.join(name), "").unwrap();
         }
         let names: Vec<_> = pictures(&folder).unwrap().iter().map(|p| p.file_name().unwrap().to_owned()).collect();
-        assert_eq!(names, ["a.jpg", "b.PNG"]);
+        assert_eq!(names, ["a.jpg", "b.PNG", "c.pnm"]);
         std::fs::remove_dir_all(&folder).unwrap();
         assert!(matches!(pictures(&folder), Err(FolderError::Unreadable { .. })));
     }

@@ -218,6 +218,8 @@ impl Session {
         let subscriber = self.context.domain_participant().create_subscriber(&policies).map_err(fail)?;
         let reader: SimpleDataReader<Content, RawAdapter<false>> =
             subscriber.create_simple_datareader_no_key(&dds_topic, None).map_err(fail)?;
+        // So that a publisher that offers less is warned of by name.
+        self.endpoints.opened(reader.guid(), &name);
         let (mut sender, receiver) = mpsc::channel(CHANNEL_DEPTH);
         self.spawn(async move {
             let mut samples = Box::pin(reader.as_async_stream());

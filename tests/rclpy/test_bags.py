@@ -16,6 +16,7 @@ from rosbags.rosbag2 import Reader, StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 from sensor_msgs.msg import CompressedImage
 
+from bench import BEST_EFFORT
 from conftest import ROOT
 
 MESSAGES = 20
@@ -126,6 +127,15 @@ def test_topics_of_any_type_are_recorded_from_rclpy(launcher, ros, tmp_path):
     for topic, msgtype, data in recorded:
         assert msgtype.endswith(f"/msg/{type(sent[topic]).__name__}")
         assert deserialize_message(data, type(sent[topic])) == sent[topic]
+
+
+def test_a_publisher_that_a_recorder_does_not_hear_is_named(launcher, ros, tmp_path):
+    """A recorder asks for what is offered when it meets a topic, as that of ROS does."""
+    first = ros.node("first").create_publisher(Twist, "/cmd_vel", MESSAGES)
+    recorder = launcher.start("jigsaw", "bag", "record", tmp_path / "bag", "--topics", "/cmd_vel")
+    ros.until(lambda: first.get_subscription_count(), "recorder")
+    ros.node("second").create_publisher(Twist, "/cmd_vel", BEST_EFFORT)
+    ros.until(lambda: "publisher on /cmd_vel does not match" in recorder.text(), "warning")
 
 
 @pytest.mark.parametrize("name", ["puzzle24", "puzzle6"])
