@@ -399,6 +399,7 @@ pub fn left_out(segmentation: &mask::Segmentation) -> Vec<String> {
         let why = match rejected.reason {
             mask::Reason::CutByFrame => "is cut by the edge of the frame",
             mask::Reason::Touching => "is two pieces that touch",
+            mask::Reason::Convex => "has neither tab nor blank, as the others have",
             _ => return None,
         };
         Some(format!("{} {why}; left out", shape(&rejected.aoi)))

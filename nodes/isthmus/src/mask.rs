@@ -3,7 +3,7 @@
 //! # Method
 //! 1. *Ground*: the frame is averaged over small blocks; the class of blocks (N. Otsu, 1979) that prevails along the rim is
 //!    ground, and a quadratic surface through it follows uneven light. Shapes may be darker, brighter or of another colour; the ground may be grained. Where
-//!    the rim does not tell (a tight crop round a shape), both classes are tried, and the one that gives
+//!    the rim does not tell (a tight crop round a shape), or what stands out is a convex sheet that fills the frame (the ground within the walls of a tray), both classes are tried, and the one that gives
 //!    whole shapes is right.
 //! 2. *Blocks that stand out* from the ground by more than its scatter are joined to connected components. The threshold is
 //!    near the ground, so that dark print on dark ground still belongs to its shape.
@@ -14,7 +14,7 @@
 //!    divided by the local contrast. Pixels beyond half-way are joined to components once more: neighbours whose shadows
 //!    or glow met come apart. Where a part of the border is soft, it is sought within the shadow that makes it so ([`Segmentation::shaded`]). Threads that hang on a shape (hairs) are taken off.
 //! 5. *Rejection*, each with its [`Reason`]: cut by the frame's edge, too small beside the others, thread-like (hairs,
-//!    scanner edges), faint without a crisp edge (glare), two shapes that touch (of about twice the usual area, with an isthmus between the halves). Where that
+//!    scanner edges), faint without a crisp edge (glare), convex beside such with bays (coins, labels, rulers), two shapes that touch (of about twice the usual area, with an isthmus between the halves). Where that
 //!    isthmus is too narrow to be the neck of one of them they are cut apart instead ([`Segmentation::separated`]).
 //!
 //! # Cost
@@ -37,6 +37,7 @@
 
 mod blocks;
 mod clipping;
+mod convex;
 mod crop;
 mod frame;
 mod ground;
@@ -89,34 +90,51 @@ impl Segmenter {
     #[must_use]
     pub fn segment(&mut self, frame: &Frame<'_>, parameters: &Parameters) -> Segmentation {
         self.blocks.fill(frame);
-        let mut best: Option<(usize, Segmentation)> = None;
-        for candidate in ground::candidates(&self.blocks) {
-            let ground = ground::find(frame, &self.blocks, candidate, std::mem::take(&mut self.residual));
-            let segmentation = self.shapes(frame, &ground, parameters);
+        // `self` is filled while the candidates are looked at.
+        let blocks = std::mem::take(&mut self.blocks);
+        let mut best: Option<((bool, usize), Segmentation)> = None;
+        for (candidate, is_told) in ground::candidates(&blocks) {
+            let ground = ground::find(frame, &blocks, candidate, std::mem::take(&mut self.residual));
+            let (segmentation, has_bays) = self.shapes(frame, &blocks, &ground, parameters);
             self.residual = ground.residual;
+            // A convex sheet that fills the frame is ground; what was taken for ground lies along the rim: the walls of a tray.
+            let fills = |aoi: &Aoi| 2 * aoi.width as usize > frame.width && 2 * aoi.height as usize > frame.height;
+            let is_sheet = |r: &Rejected| fills(&r.aoi) && (!has_bays || r.reason == Reason::Convex);
+            let is_ground = |c: &Cutout| fills(&c.aoi) && !has_bays;
+            let is_sound = !segmentation.rejected.iter().any(is_sheet) && !segmentation.cutouts.iter().any(is_ground);
             let area = segmentation.cutouts.iter().map(|c| c.aoi.width as usize * c.aoi.height as usize).sum();
-            if best.as_ref().is_none_or(|(most, _)| area > *most) {
-                best = Some((area, segmentation));
+            if best.as_ref().is_none_or(|(best, _)| (is_sound, area) > *best) {
+                best = Some(((is_sound, area), segmentation));
+            }
+            if is_told && is_sound {
+                break;
             }
         }
+        self.blocks = blocks;
         best.map(|(_, segmentation)| segmentation).unwrap_or_default()
     }
 
-    /// Finds the shapes that stand out from a ground.
-    fn shapes(&mut self, frame: &Frame<'_>, ground: &Ground, parameters: &Parameters) -> Segmentation {
-        let columns = self.blocks.columns;
+    /// Finds the shapes that stand out from a ground; whether there are such with bays.
+    fn shapes(
+        &mut self,
+        frame: &Frame<'_>,
+        blocks: &Blocks,
+        ground: &Ground,
+        parameters: &Parameters,
+    ) -> (Segmentation, bool) {
+        let columns = blocks.columns;
         self.coarse.clear();
         for (row, residual) in ground.residual.chunks_exact(columns).enumerate() {
             self.coarse.begin_row(row);
             self.coarse.add_row(residual, |r| r > ground.threshold);
         }
         self.coarse.close();
-        standing::claim(&self.blocks, &self.coarse, &mut self.owner);
-        let standing = Standing { blocks: &self.blocks, ground, components: &self.coarse, owner: &self.owner };
+        standing::claim(blocks, &self.coarse, &mut self.owner);
+        let standing = Standing { blocks, ground, components: &self.coarse, owner: &self.owner };
 
         let mut found: Vec<Found> = Vec::new();
         let mut rejected = Vec::new();
-        let block = self.blocks.size;
+        let block = blocks.size;
         for k in 0..self.coarse.list.len() {
             let c = self.coarse.list[k];
             let area = c.area * block * block;
@@ -176,7 +194,8 @@ impl Segmenter {
             }
             let contact = self.rim_contact(frame, index);
             let cutout = crop.cutout(&self.fine, index);
-            found.push(Found { cutout, area: c.area, contact, contrast: crop.contrast, shaded });
+            let is_convex = convex::may_be_convex(c, self.fine.runs_of(index)) && convex::is_convex(&cutout);
+            found.push(Found { cutout, area: c.area, contact, contrast: crop.contrast, shaded, is_convex });
         }
     }
 

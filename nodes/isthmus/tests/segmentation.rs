@@ -304,6 +304,60 @@ fn hairs_on_the_pieces() {
     check(&grey(&pixels), &necks, "hairs");
 }
 
+/// Coins, labels, strips, rulers: what has no bays, of the size of the pieces and of their level or half-way to it.
+#[test]
+fn what_has_no_bays_is_no_piece_beside_such_that_have() {
+    let things: [fn(f64, f64) -> bool; 5] = [
+        |x, y| x.hypot(y) < 60.0,
+        |x, y| x.hypot(1.4 * y) < 85.0,
+        |x, y| (0.9 * x + 0.44 * y).abs() < 80.0 && (0.9 * y - 0.44 * x).abs() < 50.0,
+        |x, y| x.abs() < 25.0 && y.abs() < 440.0,
+        |x, y| (x + y).abs() < 50.0 && (x - y).abs() < 160.0,
+    ];
+    for (k, thing) in things.into_iter().enumerate() {
+        for (shape_level, ground_level) in [(40.0, 215.0), (180.0, 30.0)] {
+            for level in [shape_level, 0.6 * shape_level + 0.4 * ground_level] {
+                let (mut pixels, necks) = scene(Camera { shape_level, ground_level, noise: 3.0, ..Camera::default() });
+                for (k, p) in pixels.iter_mut().enumerate() {
+                    if thing((k % SIDE) as f64 - 445.0, (k / SIDE) as f64 - 450.0) {
+                        *p = level as u8;
+                    }
+                }
+                let found = grey(&pixels);
+                check(&found, &necks, &format!("thing {k}"));
+                let reasons: Vec<_> = found.rejected.iter().map(|r| r.reason).collect();
+                assert_eq!(reasons, [Reason::Convex], "thing {k} of {level} on {ground_level}");
+            }
+        }
+    }
+    // Alone it may be a shape.
+    let mut pixels = vec![200; SIDE * SIDE];
+    disc(&mut pixels, (450.0, 450.0), 60.0, |_, _| 50);
+    assert_eq!(grey(&pixels).cutouts.len(), 1);
+}
+
+/// Walls on two sides and on all of them, narrow and wide, of the level of the pieces, half-way to it, and beyond it.
+#[test]
+fn walls_and_trays() {
+    for (shape_level, ground_level) in [(60.0, 215.0), (180.0, 30.0)] {
+        for (wall, sides) in [20, 45, 60].into_iter().flat_map(|wall| [(wall, 2), (wall, 4)]) {
+            for level in
+                [shape_level, 0.5 * (shape_level + ground_level), if shape_level < 100.0 { 20.0 } else { 245.0 }]
+            {
+                let (mut pixels, necks) = scene(Camera { shape_level, ground_level, noise: 3.0, ..Camera::default() });
+                for (k, p) in pixels.iter_mut().enumerate() {
+                    let (x, y) = (k % SIDE, k / SIDE);
+                    let depth = if sides == 2 { x.min(y) } else { x.min(y).min(SIDE - 1 - x).min(SIDE - 1 - y) };
+                    if depth < wall {
+                        *p = level as u8;
+                    }
+                }
+                check(&grey(&pixels), &necks, &format!("{sides} walls of {wall} px and {level} on {ground_level}"));
+            }
+        }
+    }
+}
+
 #[test]
 fn a_piece_that_the_frame_cuts_is_named() {
     let outlines: Vec<_> = [(230.0, 240.0), (650.0, 220.0), (240.0, 660.0), (880.0, 650.0)]

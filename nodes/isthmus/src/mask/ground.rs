@@ -181,8 +181,8 @@ impl Channel {
     }
 }
 
-/// Which blocks may be ground: one candidate, or both classes where the rim does not tell.
-pub(super) fn candidates(blocks: &Blocks) -> Vec<Candidate> {
+/// Which blocks may be ground, the likelier class first, and whether the rim tells that it is.
+pub(super) fn candidates(blocks: &Blocks) -> impl Iterator<Item = (Candidate, bool)> {
     let planes = &blocks.planes;
     let rim: Vec<usize> = rim_blocks(blocks).collect();
     let mut channels: Vec<Channel> = (0..planes.len()).map(Channel::Plane).collect();
@@ -191,9 +191,9 @@ pub(super) fn candidates(blocks: &Blocks) -> Vec<Candidate> {
         channels.extend([Channel::Brightest, Channel::Darkest, Channel::Difference(colour)]);
     }
     let best = channels
-        .iter()
+        .into_iter()
         .map(|channel| {
-            let values: Vec<f32> = match channel {
+            let values: Vec<f32> = match &channel {
                 Channel::Plane(c) => blocks.sampled[*c].clone(),
                 _ => blocks.samples.iter().map(|s| channel.at(planes, s.block)).collect(),
             };
@@ -201,17 +201,15 @@ pub(super) fn candidates(blocks: &Blocks) -> Vec<Candidate> {
             (channel, values, split)
         })
         .max_by(|a, b| a.2.separation.total_cmp(&b.2.separation));
-    let Some((channel, values, split)) = best else { return Vec::new() };
-    let bright = rim.iter().filter(|&&k| channel.at(planes, k) > split.threshold).count();
-    let share = bright as f64 / rim.len().max(1) as f64;
-    let class =
-        |bright: bool| Candidate { is_ground: values.iter().map(|v| (*v > split.threshold) == bright).collect() };
-    let likelier = share > 0.5;
-    let mut list = vec![class(likelier)];
-    if share.max(1.0 - share) < SURE_SHARE {
-        list.push(class(!likelier));
-    }
-    list
+    best.into_iter().flat_map(move |(channel, values, split)| {
+        let bright = rim.iter().filter(|&&k| channel.at(planes, k) > split.threshold).count();
+        let share = bright as f64 / rim.len().max(1) as f64;
+        let is_told = share.max(1.0 - share) >= SURE_SHARE;
+        let class = move |bright: bool| values.iter().map(|v| (*v > split.threshold) == bright).collect();
+        let candidates =
+            [share > 0.5, share <= 0.5].into_iter().map(move |bright| Candidate { is_ground: class(bright) });
+        candidates.filter(|c| c.is_ground.contains(&true)).map(move |candidate| (candidate, is_told))
+    })
 }
 
 /// The blocks along the rim, at several depths.

@@ -40,6 +40,8 @@ pub enum Reason {
     Faint,
     /// Two shapes touch.
     Touching,
+    /// It has no bays, as other shapes have: a coin, a label, a ruler.
+    Convex,
 }
 
 /// Something that differs from the ground and is not taken for a shape.

@@ -18,6 +18,8 @@ const TIGHT_SPAN: f64 = 0.9;
 const TIGHT_CONTACT: f64 = 0.6;
 /// ... and has this part of all the area that stands out.
 const TIGHT_SHARE: f64 = 0.9;
+/// What touches the frame's edge and is longer than this part of its smaller side is a wall, a sheet, a strip: of a size of its own.
+const WALL_SPAN: f64 = 0.5;
 /// Least number of shapes in a frame whose median area says what one shape has.
 const TOUCHING_SHAPES: usize = 3;
 /// Least area of two shapes that touch, in median areas: the two smallest pieces of a puzzle are larger together.
@@ -48,18 +50,39 @@ pub(super) struct Found {
     pub(super) contrast: f32,
     /// Whether a shadow beside it was told from it.
     pub(super) shaded: bool,
+    /// Whether it has no bays.
+    pub(super) is_convex: bool,
 }
 
-/// Rejects what is cut by the frame, or small or faint beside the other shapes.
+/// Rejects what is cut by the frame, or small or faint beside the other shapes, and convex beside such with bays; whether there are such.
 pub(super) fn sift(
     frame: &Frame<'_>,
     parameters: &Parameters,
     found: Vec<Found>,
     mut rejected: Vec<Rejected>,
-) -> Segmentation {
+) -> (Segmentation, bool) {
     let total: usize = found.iter().map(|f| f.area).sum();
-    let mut by_area: Vec<(usize, f32)> = found.iter().map(|f| (f.area, f.contrast)).collect();
+    let rim = 2 * (frame.width + frame.height);
+    let is_tight = |f: &Found| {
+        let aoi = f.cutout.aoi;
+        f64::from(aoi.width) >= TIGHT_SPAN * frame.width as f64
+            && f64::from(aoi.height) >= TIGHT_SPAN * frame.height as f64
+            && f.contact as f64 <= TIGHT_CONTACT * rim as f64
+            && f.area as f64 >= TIGHT_SHARE * total as f64
+    };
+    // Walls and sheets say nothing about the shapes beside them.
+    let is_like_others = |f: &&Found| {
+        let is_long =
+            f64::from(f.cutout.aoi.width.max(f.cutout.aoi.height)) > WALL_SPAN * frame.width.min(frame.height) as f64;
+        !f.is_convex && (f.contact == 0 || !is_long || is_tight(f))
+    };
+    let area_and_contrast = |f: &Found| (f.area, f.contrast);
+    let mut by_area: Vec<(usize, f32)> = found.iter().filter(is_like_others).map(area_and_contrast).collect();
+    if by_area.is_empty() {
+        by_area.extend(found.iter().map(area_and_contrast));
+    }
     by_area.sort_unstable_by_key(|f| f.0);
+    let total: usize = by_area.iter().map(|f| f.0).sum();
     let mut above = total;
     let typical_area = by_area
         .iter()
@@ -77,24 +100,20 @@ pub(super) fn sift(
         .filter(|a| *a as f64 >= parameters.min_relative_area * typical_area as f64)
         .collect();
     let median_area = if usual.len() < TOUCHING_SHAPES { usize::MAX } else { usual[(usual.len() - 1) / 2] };
-    let rim = 2 * (frame.width + frame.height);
     let mut cutouts = Vec::new();
+    let mut convex = Vec::new();
     let mut separated = Vec::new();
     let mut shaded = Vec::new();
     let mut open = found;
     while let Some(f) = open.pop() {
         let aoi = f.cutout.aoi;
-        let tight = f64::from(aoi.width) >= TIGHT_SPAN * frame.width as f64
-            && f64::from(aoi.height) >= TIGHT_SPAN * frame.height as f64
-            && f.contact as f64 <= TIGHT_CONTACT * rim as f64
-            && f.area as f64 >= TIGHT_SHARE * total as f64;
         let reason = if (f.area as f64) < parameters.min_relative_area * typical_area as f64 {
             Some(Reason::Small)
         } else if f64::from(f.contrast) < parameters.min_relative_contrast * f64::from(typical_contrast)
             && !has_crisp_edge(&f.cutout)
         {
             Some(Reason::Faint)
-        } else if f.contact > 0 && !tight {
+        } else if f.contact > 0 && !is_tight(&f) {
             Some(Reason::CutByFrame)
         } else if f.area as f64 >= TOUCHING_AREA * median_area as f64
             && let Some(contact) = contact(&f.cutout, median_area as f64)
@@ -112,19 +131,27 @@ pub(super) fn sift(
         };
         match reason {
             Some(reason) => rejected.push(Rejected { aoi, area: f.area, reason }),
+            None if f.is_convex => convex.push(f),
             None => {
-                if f.shaded {
-                    shaded.push(aoi);
-                }
+                shaded.extend(f.shaded.then_some(aoi));
                 cutouts.push(f.cutout);
             }
+        }
+    }
+    let has_bays = !cutouts.is_empty();
+    for f in convex {
+        if has_bays {
+            rejected.push(Rejected { aoi: f.cutout.aoi, area: f.area, reason: Reason::Convex });
+        } else {
+            shaded.extend(f.shaded.then_some(f.cutout.aoi));
+            cutouts.push(f.cutout);
         }
     }
     separated.sort_by_key(|aoi| (aoi.y, aoi.x));
     shaded.sort_by_key(|aoi| (aoi.y, aoi.x));
     cutouts.sort_by_key(|c| (c.aoi.y, c.aoi.x));
     rejected.sort_by_key(|r| (r.aoi.y, r.aoi.x));
-    Segmentation { cutouts, rejected, separated, shaded }
+    (Segmentation { cutouts, rejected, separated, shaded }, has_bays)
 }
 
 /// Whether the level falls off at the border of a shape rather than all over it: the edge of a piece, however faint, does, those of glare and
@@ -195,6 +222,7 @@ fn part(found: &Found, contact: [Point; 2], area: f64) -> Vec<Found> {
         contact: 0,
         contrast: found.contrast,
         shaded: found.shaded,
+        is_convex: false,
     };
     parts.into_iter().map(part).collect()
 }
