@@ -13,7 +13,6 @@ use std::rc::Rc;
 use std::time::Duration;
 
 use clap::Args;
-use futures::future::FusedFuture;
 use futures::{FutureExt, StreamExt};
 use jigsaw_msgs::geometry_msgs::msg::Pose;
 use jigsaw_msgs::msg::{Assembly as AssemblyMessage, PieceFeatures};
@@ -37,7 +36,8 @@ const BAD_INPUT: u8 = 2;
 /// Wait until the puzzle is assembled; print where its pieces go, and write assembly.json and assembly.png.
 ///
 /// Exit code 0 only if the puzzle was complete, 1 if it was not by the time limit (what there is, is written), 2 for bad
-/// input, 3 if the middleware failed and it is to be started again.
+/// input, 3 if the middleware failed and it is to be started again. The shapes of the pieces must be on DDS: `jigsaw cell`
+/// keeps them to itself.
 #[derive(Debug, Args)]
 pub struct WatchArgs {
     /// Folder for the results; made if it isn't there.
@@ -63,18 +63,36 @@ struct Heard {
 }
 
 impl Heard {
+    /// Whether the puzzle is complete.
+    fn is_assembled(&self, pieces: Option<usize>) -> bool {
+        self.assembly.as_ref().is_some_and(|assembly| {
+            assembly.state == AssemblyMessage::COMPLETE && pieces.is_none_or(|n| assembly.pieces.len() >= n)
+        })
+    }
+
+    /// How many of the pieces are placed whose shape is not known.
+    fn shapeless(&self) -> usize {
+        let pieces = self.assembly.iter().flat_map(|assembly| &assembly.pieces);
+        pieces.filter(|p| !self.features.contains_key(&p.id)).count()
+    }
+
     /// Whether the puzzle is complete and the shape of every piece is known.
     fn is_complete(&self, pieces: Option<usize>) -> bool {
-        self.assembly.as_ref().is_some_and(|assembly| {
-            assembly.state == AssemblyMessage::COMPLETE
-                && pieces.is_none_or(|n| assembly.pieces.len() >= n)
-                && assembly.pieces.iter().all(|p| self.features.contains_key(&p.id))
-        })
+        self.is_assembled(pieces) && self.shapeless() == 0
+    }
+
+    /// How long to wait for what is missing still; `None` for the assembly itself.
+    fn patience(&self, pieces: Option<usize>) -> Option<Duration> {
+        let patience = if self.shapeless() == 0 { PICTURE_PATIENCE } else { SHAPE_PATIENCE };
+        self.is_assembled(pieces).then_some(patience)
     }
 }
 
 /// How long to wait for the picture of a complete assembly, which comes after it.
 const PICTURE_PATIENCE: Duration = Duration::from_secs(2);
+
+/// How long to wait for the shapes of the pieces of a complete assembly. They come before it, or, latched, within 3 s.
+const SHAPE_PATIENCE: Duration = Duration::from_secs(10);
 
 /// Runs the command.
 #[must_use]
@@ -123,6 +141,13 @@ pub fn run(args: WatchArgs) -> ExitCode {
         complain!("jigsaw watch: {}: {error}", args.out.display());
         return ExitCode::from(BAD_INPUT);
     }
+    if heard.shapeless() > 0 {
+        complain!(
+            "jigsaw watch: assembly.json lacks {} pieces whose shapes were not published on pieces/features (jigsaw cell keeps them \
+             to itself)",
+            heard.shapeless()
+        );
+    }
     if heard.picture.is_none() {
         complain!("jigsaw watch: no picture was published on assembly/image");
     }
@@ -140,6 +165,7 @@ fn listen(
     let mut pictures = session.subscribe(&topics::ASSEMBLY_IMAGE)?;
     Ok(async move {
         let mut late = futures::future::Fuse::terminated();
+        let mut patience = None;
         loop {
             futures::select! {
                 assembly = assemblies.next() => match assembly {
@@ -163,8 +189,10 @@ fn listen(
                 },
                 _ = late => return,
             }
-            if late.is_terminated() && heard.borrow().is_complete(pieces) {
-                late = FutureExt::fuse(smol::Timer::after(PICTURE_PATIENCE));
+            let wanted = heard.borrow().patience(pieces);
+            if patience != wanted {
+                patience = wanted;
+                late = FutureExt::fuse(wanted.map_or_else(smol::Timer::never, smol::Timer::after));
             }
         }
     })

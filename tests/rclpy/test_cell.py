@@ -1,5 +1,7 @@
 """The three nodes as processes, between a camera and an arm that are rclpy nodes."""
 
+import json
+
 import numpy
 import pytest
 from builtin_interfaces.msg import Time
@@ -69,6 +71,22 @@ def test_composed_cell(launcher, ros, generate):
     arm = Arm(ros)
     truth = camera.show_puzzle_to_composed_cell(puzzle, arm)
     check_assembly(arm, truth, arm.complete(6))
+
+
+@pytest.mark.parametrize("composed", [False, True], ids=["processes", "composed"])
+def test_watch_writes_what_is_on_dds(launcher, ros, generate, tmp_path, composed):
+    """A composed cell keeps the shapes to itself, without which nothing can be said in pixels."""
+    source = f"capture_node:source:={generate(2, 3, 5).folder}"
+    if composed:
+        launcher.start("jigsaw", "cell", "--ros-args", "-p", source)
+    else:
+        launcher.cell("-p", source)
+    Arm(ros).complete(6)
+    code, said = launcher.run("jigsaw", "watch", "--out", tmp_path, "--timeout", 60)
+    assert "6/6 pieces placed" in said
+    written = json.loads((tmp_path / "assembly.json").read_text())["pieces"]
+    assert (code, len(written)) == ((1, 0) if composed else (0, 6))
+    assert ("lacks 6 pieces" in said) == composed
 
 
 def test_png_frames_namespace_and_remaps(launcher, ros, generate):
