@@ -9,6 +9,8 @@ use crate::outline::{KEYS, Outline, SHAPE_SAMPLES, Segment};
 
 /// Entries a leaf of the tree holds: below this a linear scan is faster than descending.
 const LEAF: usize = 16;
+/// For fewer queries all entries are one leaf: a tree costs as much as so many scans.
+const FEW: usize = 16;
 
 /// One tab in the index.
 #[derive(Debug, Clone)]
@@ -57,6 +59,8 @@ impl Windows {
 pub(crate) struct Index<'a> {
     entries: Vec<Entry<'a>>,
     axes: Vec<u8>,
+    /// Entries a leaf holds.
+    leaf: usize,
 }
 
 /// A tab found: distance, then piece and tab.
@@ -81,10 +85,12 @@ impl Hit {
 }
 
 impl<'a> Index<'a> {
-    pub(crate) fn new(mut entries: Vec<Entry<'a>>) -> Self {
+    /// For about so many queries.
+    pub(crate) fn new(mut entries: Vec<Entry<'a>>, queries: usize) -> Self {
         let mut axes = vec![0u8; entries.len()];
-        build(&mut entries, &mut axes);
-        Self { entries, axes }
+        let leaf = if queries < FEW { entries.len() } else { LEAF };
+        build(&mut entries, &mut axes, leaf);
+        Self { entries, axes, leaf }
     }
 
     /// The `k` nearest tabs of other pieces within the windows, nearest first.
@@ -95,7 +101,7 @@ impl<'a> Index<'a> {
     }
 
     fn search(&self, from: usize, to: usize, offsets: [f32; KEYS], query: &mut Query) {
-        if to - from <= LEAF {
+        if to - from <= self.leaf {
             for entry in &self.entries[from..to] {
                 query.offer(entry);
             }
@@ -117,8 +123,8 @@ impl<'a> Index<'a> {
     }
 }
 
-fn build(entries: &mut [Entry], axes: &mut [u8]) {
-    if entries.len() <= LEAF {
+fn build(entries: &mut [Entry], axes: &mut [u8], leaf: usize) {
+    if entries.len() <= leaf {
         return;
     }
     // The axis of the greatest spread halves the range best.
@@ -137,8 +143,8 @@ fn build(entries: &mut [Entry], axes: &mut [u8]) {
     axes[middle] = axis as u8;
     let (left, right) = entries.split_at_mut(middle);
     let (left_axes, right_axes) = axes.split_at_mut(middle);
-    build(left, left_axes);
-    build(&mut right[1..], &mut right_axes[1..]);
+    build(left, left_axes, leaf);
+    build(&mut right[1..], &mut right_axes[1..], leaf);
 }
 
 struct Query<'q> {

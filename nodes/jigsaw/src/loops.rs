@@ -71,6 +71,14 @@ struct Way {
     edges: [usize; 2],
 }
 
+impl Way {
+    /// This step, and one more from where it leads.
+    fn then(&self, second: &Self) -> Self {
+        let edges = [self.edges[0], second.edges[0]];
+        Self { to: second.to, via: Some(self.to), pose: self.pose * second.pose, edges }
+    }
+}
+
 /// Where a way leads: the piece, and its centroid's place across the line on which ways are sorted.
 #[derive(Clone, Copy)]
 struct Place {
@@ -204,30 +212,29 @@ impl<'a> Ways<'a> {
         all
     }
 
-    /// Ways of one and two steps from `a` to pieces of higher rank, ordered by the piece and by where they lead: compared
-    /// in this order, what is near stays near.
+    /// Ways of one and two steps from `a` to pieces of higher rank to which others lead as well, ordered by the piece and by
+    /// where they lead: compared in this order, what is near stays near.
     fn from(&self, a: usize) -> Vec<(Place, Way)> {
-        let mut long: Vec<Way> = Vec::new();
+        let mut long: Vec<(usize, &Way, Option<&Way>)> = Vec::new();
         for first in self.steps[a].iter().filter(|w| w.to > a) {
-            long.push(*first);
+            long.push((first.to, first, None));
             let arrives = self.arrives(first);
-            for second in self.steps[first.to].iter().filter(|w| w.to > a && w.to != first.to) {
-                if self.slots.conflict(arrives, self.leaves(first.to, second)) {
-                    continue;
-                }
-                long.push(Way {
-                    to: second.to,
-                    via: Some(first.to),
-                    pose: first.pose * second.pose,
-                    edges: [first.edges[0], second.edges[0]],
-                });
-            }
+            let onwards = self.steps[first.to].iter().filter(|w| w.to > a && w.to != first.to);
+            let free = onwards.filter(|second| !self.slots.conflict(arrives, self.leaves(first.to, second)));
+            long.extend(free.map(|second| (second.to, first, Some(second))));
         }
-        let mut order: Vec<(Place, usize)> = long.iter().enumerate().map(|(k, way)| (self.place(way), k)).collect();
-        order.sort_unstable_by(|(p, i), (q, j)| {
-            p.to.cmp(&q.to).then(p.x.total_cmp(&q.x)).then_with(|| long[*i].edges.cmp(&long[*j].edges))
-        });
-        order.into_iter().map(|(place, k)| (place, long[k])).collect()
+        long.sort_unstable_by_key(|(to, ..)| *to);
+        let mut ways = Vec::new();
+        // Most lead where no other does, and are not worth more than that.
+        for group in long.chunk_by(|p, q| p.0 == q.0).filter(|g| g.len() > 1) {
+            let begin = ways.len();
+            ways.extend(group.iter().map(|(_, first, second)| {
+                let way = second.map_or(**first, |second| first.then(second));
+                (self.place(&way), way)
+            }));
+            ways[begin..].sort_unstable_by(|(p, v), (q, w)| p.x.total_cmp(&q.x).then_with(|| v.edges.cmp(&w.edges)));
+        }
+        ways
     }
 
     fn place(&self, way: &Way) -> Place {

@@ -37,29 +37,38 @@ struct Key {
     pose: [i64; 3],
 }
 
-/// A pose rounded to a grid.
+/// A pose rounded to a grid: where the centroid lies, and the angle.
 struct Rounded {
     place: [i64; 3],
-    pose: Isometry2<f64>,
+    centre: Point,
+    angle: f64,
+    /// From there to the pose itself.
+    shift: Vector2<f64>,
+    turn: f64,
 }
 
 impl Rounded {
     /// `mesh` in piece scales, which as an angle moves what is a scale away by as much.
     fn new(a: &Outline, b_from_a: &Isometry2<f64>, mesh: f64) -> Self {
-        let centre = b_from_a * a.centroid;
+        let (centre, angle) = (b_from_a * a.centroid, b_from_a.rotation.angle());
         let length = mesh * a.scale;
-        let place = [centre.x / length, centre.y / length, b_from_a.rotation.angle() / mesh].map(|v| v.round() as i64);
-        let [x, y, angle] = place.map(|v| v as f64);
-        let rotation = UnitComplex::new(angle * mesh);
-        let translation = Vector2::new(x, y) * length - rotation * a.centroid.coords;
-        Self { place, pose: Isometry2::from_parts(translation.into(), rotation) }
+        let place = [centre.x / length, centre.y / length, angle / mesh].map(|v| v.round() as i64);
+        let [x, y, steps] = place.map(|v| v as f64);
+        let rounded = Point::new(x * length, y * length);
+        Self { place, centre: rounded, angle: steps * mesh, shift: centre - rounded, turn: angle - steps * mesh }
+    }
+
+    /// The rounded pose.
+    fn pose(&self, a: &Outline) -> Isometry2<f64> {
+        let rotation = UnitComplex::new(self.angle);
+        Isometry2::from_parts((self.centre.coords - rotation * a.centroid.coords).into(), rotation)
     }
 
     /// Small motion at a point (of `b`'s image) from the rounded pose to the pose itself.
-    fn motion_to(&self, b_from_a: &Isometry2<f64>, at: &Point) -> Vector3<f64> {
-        let motion = b_from_a * self.pose.inverse();
-        let shift = motion * at - at;
-        Vector3::new(shift.x, shift.y, motion.rotation.angle())
+    fn motion_at(&self, at: &Point) -> Vector3<f64> {
+        let arm = at - self.centre;
+        let shift = self.shift + UnitComplex::new(self.turn) * arm - arm;
+        Vector3::new(shift.x, shift.y, self.turn)
     }
 }
 
@@ -119,7 +128,7 @@ impl Memory {
             known.0 = self.solution;
             return known.1;
         }
-        let area = overlap_area(a, b, &rounded.pose);
+        let area = overlap_area(a, b, &rounded.pose(a));
         self.shard(key.pieces).overlaps.insert(key, (self.solution, area));
         area
     }
@@ -163,10 +172,10 @@ impl Memory {
             known.1
         });
         let equations = known.unwrap_or_else(|| {
-            let computed = follow(a, b, &rounded.pose, 0.5 * band * (a.scale + b.scale), stride);
+            let computed = follow(a, b, &rounded.pose(a), 0.5 * band * (a.scale + b.scale), stride);
             self.shard(key.pieces).contacts.insert(key, (self.solution, computed));
             computed
         })?;
-        Some(equations.contact(&rounded.motion_to(b_from_a, &equations.centre), prior))
+        Some(equations.contact(&rounded.motion_at(&equations.centre), prior))
     }
 }

@@ -107,12 +107,14 @@ impl Pose {
 
 /// Best rigid pose of the samples of the two match segments, pair by pair (Umeyama 1991 without scale).
 fn first_pose(tab: &Segment, mouth: &Segment) -> Pose {
-    let (mut dot, mut cross) = (0f32, 0f32);
-    for (a, b) in tab.samples.iter().zip(&mouth.samples) {
-        dot += a[0] * b[0] + a[1] * b[1];
-        cross += a[0] * b[1] - a[1] * b[0];
+    let (mut dots, mut crosses) = ([0f32; LANES], [0f32; LANES]);
+    for (a, b) in tab.samples.chunks_exact(LANES).zip(mouth.samples.chunks_exact(LANES)) {
+        for l in 0..LANES {
+            dots[l] += a[l][0] * b[l][0] + a[l][1] * b[l][1];
+            crosses[l] += a[l][0] * b[l][1] - a[l][1] * b[l][0];
+        }
     }
-    let (dot, cross) = (f64::from(dot), f64::from(cross));
+    let [dot, cross] = [dots, crosses].map(|lanes| f64::from(lanes.iter().sum::<f32>()));
     let norm = dot.hypot(cross).max(f64::EPSILON);
     let (cos, sin) = (dot / norm, cross / norm);
     let [ax, ay] = tab.middle.map(f64::from);

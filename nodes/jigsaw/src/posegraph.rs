@@ -2,8 +2,9 @@
 //!
 //! Each contact of two pieces says how one should move relative to the other, as a quadratic form in the small motion
 //! (x, y, turn) at the contact (Lu and Milios 1997, *Globally consistent range scan alignment*). The sum over all
-//! contacts is minimised by one sparse Cholesky factorisation in 3 x 3 blocks, nodes eliminated by nested dissection along
-//! the axes (George 1973; fill O(n log n) on the planar graph of a puzzle). The first node of each connected part stays where it is.
+//! contacts is minimised by one sparse Cholesky factorisation in 3 x 3 blocks, nodes eliminated in the order of minimum degree
+//! (Tinney and Walker 1967; about O(n log n) of fill on the planar graph of a puzzle). The first node of each connected part
+//! stays where it is.
 
 use nalgebra::{Matrix3, Point2, UnitComplex, Vector3};
 
@@ -53,37 +54,54 @@ pub(crate) struct Plan {
 }
 
 impl Plan {
-    /// Nodes lie at the reference points.
-    pub(crate) fn new(references: &[Point2<f64>], factors: &[Factor]) -> Self {
-        let n = references.len();
+    /// So many nodes; of those left the one with the fewest neighbours is eliminated first.
+    pub(crate) fn new(n: usize, factors: &[Factor]) -> Self {
         let mut around: Vec<Vec<usize>> = vec![Vec::new(); n];
         for f in factors.iter().filter(|f| f.a != f.b) {
             around[f.a].push(f.b);
             around[f.b].push(f.a);
         }
-        let mut order = Vec::with_capacity(n);
-        dissect(&mut (0..n).collect::<Vec<usize>>(), references, &around, &mut vec![false; n], &mut order);
+        let mut of_degree: Vec<Vec<usize>> = vec![Vec::new(); n];
+        for (node, others) in around.iter().enumerate() {
+            of_degree[others.len()].push(node);
+        }
+        let (mut order, mut rows) = (Vec::with_capacity(n), Vec::with_capacity(n));
+        let mut gone = vec![false; n];
+        // Of each node the last one that was seen beside it: whom it is beside, it stays beside.
+        let mut beside = vec![n; n];
+        let mut least = 0;
+        while order.len() < n {
+            let Some(node) = of_degree[least].pop() else {
+                least += 1;
+                continue;
+            };
+            if gone[node] || around[node].len() != least {
+                continue;
+            }
+            gone[node] = true;
+            // What is connected through the node is connected without it.
+            let row = std::mem::take(&mut around[node]);
+            for &other in &row {
+                let others = &mut around[other];
+                others.retain(|k| *k != node);
+                others.iter().for_each(|k| beside[*k] = other);
+                beside[other] = other;
+                others.extend(row.iter().filter(|k| beside[**k] != other));
+                of_degree[others.len()].push(other);
+                least = least.min(others.len());
+            }
+            order.push(node);
+            rows.push(row);
+        }
         let mut place = vec![0; n];
         for (k, node) in order.iter().enumerate() {
             place[*node] = k;
         }
-        // The row of a node has its own later neighbours, and what is left of the rows of those eliminated into it.
-        let mut into: Vec<Vec<usize>> = vec![Vec::new(); n];
         let (mut starts, mut columns) = (vec![0], Vec::new());
-        let mut row = Vec::new();
-        for (k, node) in order.iter().enumerate() {
-            row.clear();
-            row.extend(around[*node].iter().map(|other| place[*other]));
-            for child in std::mem::take(&mut into[k]) {
-                row.extend_from_slice(&columns[starts[child]..starts[child + 1]]);
-            }
-            row.retain(|later| *later > k);
+        for row in &mut rows {
+            row.iter_mut().for_each(|node| *node = place[*node]);
             row.sort_unstable();
-            row.dedup();
-            if let Some(next) = row.first() {
-                into[*next].push(k);
-            }
-            columns.extend_from_slice(&row);
+            columns.extend_from_slice(row);
             starts.push(columns.len());
         }
         Self { order, place, starts, columns }
@@ -174,38 +192,6 @@ fn roots(n: usize, factors: &[Factor]) -> Vec<usize> {
     (0..n).filter(|k| parts[*k] == *k).collect()
 }
 
-/// Appends some nodes to an order of elimination: one half of them, then the other, then those that part the two.
-/// `beyond` is false for all nodes, before and after.
-fn dissect(
-    nodes: &mut [usize],
-    at: &[Point2<f64>],
-    around: &[Vec<usize>],
-    beyond: &mut [bool],
-    order: &mut Vec<usize>,
-) {
-    /// So few are not worth parting.
-    const FEW: usize = 4;
-    if nodes.len() <= FEW {
-        order.extend_from_slice(nodes);
-        return;
-    }
-    let extent = |axis: usize| {
-        let along = || nodes.iter().map(|k| at[*k][axis]);
-        along().fold(f64::NEG_INFINITY, f64::max) - along().fold(f64::INFINITY, f64::min)
-    };
-    let axis = usize::from(extent(1) > extent(0));
-    let middle = nodes.len() / 2;
-    nodes.select_nth_unstable_by(middle, |p, q| at[*p][axis].total_cmp(&at[*q][axis]).then(p.cmp(q)));
-    let (near, far) = nodes.split_at_mut(middle);
-    far.iter().for_each(|k| beyond[*k] = true);
-    let (mut parting, mut near): (Vec<usize>, Vec<usize>) =
-        near.iter().partition(|k| around[**k].iter().any(|other| beyond[*other]));
-    far.iter().for_each(|k| beyond[*k] = false);
-    dissect(&mut near, at, around, beyond, order);
-    dissect(far, at, around, beyond, order);
-    order.append(&mut parting);
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -227,7 +213,7 @@ mod tests {
                 }
             })
             .collect();
-        let motion = Plan::new(&references, &factors).minimise(&references, &factors);
+        let motion = Plan::new(references.len(), &factors).minimise(&references, &factors);
         let mut gradient = vec![Vector3::<f64>::zeros(); 6];
         for f in &factors {
             let (ja, jb) = (lever(references[f.a], f.centre), lever(references[f.b], f.centre));

@@ -336,10 +336,12 @@ impl Solver {
             }
             entries
         };
-        // Where no mouth is new nobody asks for all tabs.
-        let offered = if lists.iter().all(|(current, _)| *current) { 0 } else { outlines.len() };
-        let all = Index::new(entries(&mut (0..offered)));
-        let new = Index::new(entries(&mut (0..outlines.len()).filter(|k| !self.kept[*k].offered)));
+        // New mouths ask for all tabs, others for new ones.
+        let mouths = |current: bool| -> usize {
+            lists.iter().zip(&outlines).filter(|(list, _)| list.0 == current).map(|(_, o)| o.mouths.len()).sum()
+        };
+        let all = Index::new(entries(&mut (0..outlines.len())), mouths(false));
+        let new = Index::new(entries(&mut (0..outlines.len()).filter(|k| !self.kept[*k].offered)), mouths(true));
         let most = self.params.candidates;
         let free = self.params.fit_clearance;
         let whole = AtomicBool::new(true);

@@ -34,7 +34,6 @@ impl Assembler<'_> {
                 }
             }
         }
-        pairs.sort_unstable();
         pairs
     }
 
@@ -49,21 +48,21 @@ impl Assembler<'_> {
             place[*k] = i;
         }
         let references: Vec<Point2<f64>> =
-            members.iter().map(|k| self.state.pose[*k] * self.outlines[*k].centroid).collect();
+            members.iter().map(|k| self.state.pose(*k) * self.outlines[*k].centroid).collect();
         let pairs = self.neighbours(island);
         let factors: Vec<Factor> = pairs
             .par_iter()
             .filter_map(|&(p, q)| {
-                let poses = [self.state.pose[p], self.state.pose[q]];
+                let poses = [*self.state.pose(p), *self.state.pose(q)];
                 self.factor((p, place[p]), (q, place[q]), &poses, step)
             })
             .collect();
         let plan = self.plan.take().filter(|plan| plan.suits(members.len(), &factors));
-        let plan = plan.unwrap_or_else(|| Plan::new(&references, &factors));
+        let plan = plan.unwrap_or_else(|| Plan::new(members.len(), &factors));
         let motion = plan.minimise(&references, &factors);
         self.plan = Some(plan);
         for (k, motion) in members.into_iter().zip(motion) {
-            self.state.pose[k] = self.moved(k, &self.state.pose[k], &motion);
+            self.state.lay(k, self.moved(k, self.state.pose(k), &motion));
         }
     }
 

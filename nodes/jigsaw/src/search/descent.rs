@@ -55,7 +55,7 @@ impl Assembler<'_> {
         let filled = |piece: usize, at: Point2<f64>| {
             self.state.members(self.state.island(piece)).filter(|q| *q != piece).any(|q| {
                 let raster = &self.outlines[q].raster;
-                raster.cell_of(self.state.pose[q].inverse() * at).is_some_and(|cell| raster.distance[cell] < 0.0)
+                raster.cell_of(self.state.pose(q).inverse() * at).is_some_and(|cell| raster.distance[cell] < 0.0)
             })
         };
         let placed = (0..self.outlines.len()).filter(|k| !self.state.alone(*k));
@@ -63,7 +63,7 @@ impl Assembler<'_> {
         mouths
             .filter(|(k, mouth)| {
                 let middle = mouth.origin + Vector2::new(f64::from(mouth.middle[0]), f64::from(mouth.middle[1]));
-                !filled(*k, self.state.pose[*k] * middle)
+                !filled(*k, self.state.pose(*k) * middle)
             })
             .count()
     }

@@ -220,7 +220,7 @@ impl Assembler<'_> {
 
     fn place(&mut self, trial: &Trial, evidence: f64) {
         self.state.unite(trial.piece, trial.island);
-        self.state.pose[trial.piece] = trial.pose;
+        self.state.lay(trial.piece, trial.pose);
         self.state.fitted.insert(trial.piece, evidence);
         self.take(trial.edge);
         // Whatever else agrees with the pose is a mating as well.

@@ -118,9 +118,9 @@ impl Assembler<'_> {
     pub(super) fn place_of(&self, edge: usize, piece: usize, away: Option<Away>) -> Option<Place> {
         let e = &self.edges[edge];
         let (held, pose) = if piece == e.a {
-            (e.b, self.state.pose[e.b] * e.b_from_a)
+            (e.b, self.state.pose(e.b) * e.b_from_a)
         } else {
-            (e.a, self.state.pose[e.a] * e.b_from_a.inverse())
+            (e.a, self.state.pose(e.a) * e.b_from_a.inverse())
         };
         let island = self.state.island(held);
         let beside = self.beside(piece, island, away, &pose);
@@ -153,7 +153,7 @@ impl Assembler<'_> {
 
     /// What a piece costs where it lies.
     pub(super) fn cost_of_placed(&self, piece: usize) -> Option<f64> {
-        let pose = &self.state.pose[piece];
+        let pose = self.state.pose(piece);
         let beside = self.beside(piece, self.state.island(piece), None, pose);
         self.gap_cost(piece, &self.seen_from(&beside, pose), COARSE)
     }
@@ -189,7 +189,7 @@ impl Assembler<'_> {
 
     /// Pieces, and a pose as seen from each of them.
     fn seen_from(&self, pieces: &[usize], pose: &Isometry2<f64>) -> Vec<(usize, Isometry2<f64>)> {
-        pieces.iter().map(|q| (*q, self.state.pose[*q].inverse() * pose)).collect()
+        pieces.iter().map(|q| (*q, self.state.pose(*q).inverse() * pose)).collect()
     }
 
     /// Greatest overlap of a piece with others from which it is seen in some poses, in squared piece scales.
@@ -206,7 +206,7 @@ impl Assembler<'_> {
     fn settled(&self, place: &Place) -> Isometry2<f64> {
         let mut pose = place.pose;
         for _ in 0..ROUNDS {
-            let contact = |q: &usize| self.factor((place.piece, 1), (*q, 0), &[pose, self.state.pose[*q]], COARSE);
+            let contact = |q: &usize| self.factor((place.piece, 1), (*q, 0), &[pose, *self.state.pose(*q)], COARSE);
             let factors: Vec<Factor> = place.beside.iter().filter_map(contact).collect();
             let centre = pose * self.outlines[place.piece].centroid;
             let Some(motion) = posegraph::settle(centre, &factors) else { break };

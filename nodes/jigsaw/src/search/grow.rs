@@ -86,9 +86,9 @@ impl Assembler<'_> {
     /// What a candidate says about where the island `moving` lies in the other one.
     fn said(&self, k: usize, moving: usize) -> Said<'_> {
         let e = &self.edges[k];
-        let b_from_a = self.state.pose[e.b] * e.b_from_a * self.state.pose[e.a].inverse();
+        let b_from_a = self.state.pose(e.b) * e.b_from_a * self.state.pose(e.a).inverse();
         let (from, pose) = if self.state.island(e.a) == moving { (e.b, b_from_a) } else { (e.a, b_from_a.inverse()) };
-        Said { edge: e, from, fixed: self.state.pose[from], pose }
+        Said { edge: e, from, fixed: *self.state.pose(from), pose }
     }
 
     /// The candidates that agree with the one at `i` on the pose of the island `moving`.
@@ -99,7 +99,7 @@ impl Assembler<'_> {
         for (j, other) in candidates.iter().enumerate().filter(|(j, _)| *j != i) {
             let e = &self.edges[*other];
             let piece = if self.state.island(e.a) == moving { e.a } else { e.b };
-            let [p, q] = [i, j].map(|k| said[k].pose * self.state.pose[piece]);
+            let [p, q] = [i, j].map(|k| said[k].pose * self.state.pose(piece));
             if !FAR.allows(self.outlines[piece], &p, &q) {
                 continue;
             }

@@ -33,11 +33,9 @@ impl Assembler<'_> {
             if order.iter().any(|k| !self.admissible(*k)) {
                 continue;
             }
-            let saved = (order.iter().any(|k| !self.same_island(*k))).then(|| self.state.clone());
-            let ok = order.iter().all(|k| self.join(*k));
-            if let (false, Some(saved)) = (ok, saved) {
-                self.state = saved;
-            }
+            self.state.begin();
+            let joined = order.iter().all(|k| self.join(*k));
+            self.state.end(joined);
         }
     }
 
@@ -77,7 +75,7 @@ impl Assembler<'_> {
     /// Whether the poses of its pieces, in one island, say the same as the candidate.
     pub(super) fn agrees(&self, k: usize) -> bool {
         let e = &self.edges[k];
-        let actual = self.state.pose[e.b].inverse() * self.state.pose[e.a];
+        let actual = self.state.pose(e.b).inverse() * self.state.pose(e.a);
         let within = |t: Tolerance| t.allows(self.outlines[e.a], &actual, &e.b_from_a);
         within(MIN_AGREE)
             || (within(AGREE) && self.closure.admits(loops::deviation(e, &actual, self.outlines[e.a].centroid)))
@@ -94,7 +92,7 @@ impl Assembler<'_> {
         }
         let e = &self.edges[k];
         let (ia, ib) = (self.state.island(e.a), self.state.island(e.b));
-        let b_from_a = self.state.pose[e.b] * e.b_from_a * self.state.pose[e.a].inverse();
+        let b_from_a = self.state.pose(e.b) * e.b_from_a * self.state.pose(e.a).inverse();
         if !self.merge(ia, ib, &b_from_a) {
             return false;
         }
@@ -122,7 +120,7 @@ impl Assembler<'_> {
             let centre = self.slots.segment(e.slots[0]).origin;
             for (dx, dy) in [(0.3, 0.0), (-0.3, 0.0), (0.0, 0.3), (0.0, -0.3)] {
                 let p = centre + Vector2::new(dx, dy) * self.scale;
-                let (in_a, in_b) = (self.state.pose[e.a] * p, self.state.pose[e.b] * (e.b_from_a * p));
+                let (in_a, in_b) = (self.state.pose(e.a) * p, self.state.pose(e.b) * (e.b_from_a * p));
                 let forward = self.state.island(e.a) == ia;
                 here.push(if forward { in_a } else { in_b });
                 there.push(if forward { in_b } else { in_a });
@@ -133,7 +131,7 @@ impl Assembler<'_> {
 
     /// Where a piece's centroid lies in its island.
     pub(super) fn centre_of(&self, piece: usize) -> Point2<f64> {
-        self.state.pose[piece] * self.outlines[piece].centroid
+        self.state.pose(piece) * self.outlines[piece].centroid
     }
 
     pub(super) fn take(&mut self, k: usize) {
@@ -149,7 +147,7 @@ impl Assembler<'_> {
             if self.state.size(ia) <= self.state.size(ib) { (ia, ib, *b_from_a) } else { (ib, ia, b_from_a.inverse()) };
         let moved: Vec<usize> = self.state.members(from).collect();
         for k in moved {
-            self.state.pose[k] = motion * self.state.pose[k];
+            self.state.lay(k, motion * self.state.pose(k));
         }
         self.state.unite(from, to);
         // Drift grows with the way through the island; adjusting when it is half as large again keeps it small at little cost.
@@ -157,9 +155,9 @@ impl Assembler<'_> {
         if self.params.pose_graph
             && self.params.policy == Policy::Standard
             && size >= 6
-            && size >= 3 * self.state.adjusted[to].max(2) / 2
+            && size >= 3 * self.state.adjusted(to).max(2) / 2
         {
-            self.state.adjusted[to] = size;
+            self.state.note_adjusted(to);
             self.adjust(to, COARSE);
         }
         true
@@ -174,15 +172,13 @@ impl Assembler<'_> {
     fn islands_overlap(&self, ia: usize, ib: usize, b_from_a: &Isometry2<f64>) -> f64 {
         let mut worst = 0.0f64;
         for p in self.state.members(ia) {
-            let pose = b_from_a * self.state.pose[p];
-            let centre = pose * self.outlines[p].centroid;
+            let centre = b_from_a * self.centre_of(p);
             for q in self.state.members(ib) {
                 let reach = self.outlines[p].radius + self.outlines[q].radius;
-                let other = self.state.pose[q] * self.outlines[q].centroid;
-                if (centre - other).norm_squared() > reach * reach {
+                if (centre - self.centre_of(q)).norm_squared() > reach * reach {
                     continue;
                 }
-                let q_from_p = self.state.pose[q].inverse() * pose;
+                let q_from_p = self.state.pose(q).inverse() * b_from_a * self.state.pose(p);
                 let area = self.memory.overlap(self.outlines[p], self.outlines[q], &q_from_p);
                 worst = worst.max(area / (self.outlines[p].scale * self.outlines[q].scale));
                 if worst > self.tolerated() {

@@ -205,11 +205,12 @@ impl Assembler<'_> {
         let known = wrong.len();
         let weight = (most / rest.len().max(1) as f64).min(1.0);
         let mut share = 0.0;
-        for _ in 0..STEPS {
+        let mut likelier = vec![0.0; rest.len()];
+        for step in 0..STEPS {
             wrong.truncate(known);
             let mut sum = 0.0;
-            for (best, second) in &rest {
-                let odds = share / (1.0 - share) * self.model.evidence(*best).exp();
+            for ((best, second), likelier) in rest.iter().zip(&likelier) {
+                let odds = share / (1.0 - share) * likelier;
                 let is_right = odds / (1.0 + odds);
                 sum += is_right;
                 if weight > 0.0 {
@@ -217,7 +218,11 @@ impl Assembler<'_> {
                     wrong.extend(second.map(|second| (second, weight * is_right)));
                 }
             }
-            self.model = Model::between(right, weighted_spread(&mut wrong.clone()));
+            // Where the rest doesn't count, nothing changes the model any more.
+            if weight > 0.0 || step == 0 {
+                self.model = Model::between(right, weighted_spread(&mut wrong.clone()));
+                likelier = rest.iter().map(|(best, _)| self.model.evidence(*best).exp()).collect();
+            }
             // As if one mouth more had its tab, and one more had not.
             share = (sum + 1.0) / (rest.len() as f64 + 2.0);
         }
@@ -270,10 +275,10 @@ fn weigh(guess: &Closure, decoys: &loops::Decoys, found: &mut [loops::Loop]) -> 
 
 /// Ranks the candidates of each mouth and tab by cost.
 pub(super) fn rank(edges: &mut [Edge], slots: &Slots) {
-    let mut order: Vec<usize> = (0..edges.len()).collect();
-    order.sort_unstable_by(|p, q| edges[*p].cost.total_cmp(&edges[*q].cost).then(p.cmp(q)));
+    let mut order: Vec<(f64, usize)> = edges.iter().enumerate().map(|(k, e)| (e.cost, k)).collect();
+    order.sort_unstable_by(|p, q| p.0.total_cmp(&q.0).then(p.1.cmp(&q.1)));
     let mut counts = vec![0; slots.count()];
-    for k in order {
+    for (_, k) in order {
         let [tab, mouth] = edges[k].slots.map(|s| s.number);
         (edges[k].tab_rank, edges[k].mouth_rank) = (counts[tab], counts[mouth]);
         counts[tab] += 1;

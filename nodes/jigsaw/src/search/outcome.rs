@@ -52,7 +52,7 @@ impl Assembler<'_> {
         let mut met: Vec<(f64, [usize; 2], [usize; 2])> = Vec::new();
         for (p, q) in self.state.islands().flat_map(|k| self.neighbours(k)) {
             for [a, b] in [[p, q], [q, p]] {
-                let b_from_a = self.state.pose[b].inverse() * self.state.pose[a];
+                let b_from_a = self.state.pose(b).inverse() * self.state.pose(a);
                 let tabs = self.outlines[a].tabs.iter().enumerate();
                 for (tab, t) in tabs.filter(|(tab, _)| !settled[self.slots.tab(a, *tab).number]) {
                     let mouths = self.outlines[b].mouths.iter().enumerate();
@@ -70,7 +70,7 @@ impl Assembler<'_> {
             if ends.iter().any(|s| settled[s.number]) {
                 continue;
             }
-            let b_from_a = self.state.pose[b].inverse() * self.state.pose[a];
+            let b_from_a = self.state.pose(b).inverse() * self.state.pose(a);
             let (t, m) = (&self.outlines[a].tabs[tab], &self.outlines[b].mouths[mouth]);
             let from = (&b_from_a, self.prior.mean);
             let scale = self.outlines[b].scale;
@@ -133,7 +133,7 @@ impl Assembler<'_> {
         let confidence: Vec<f64> = evidence.iter().map(|e| sure((e - AGREEMENT).max(0.0))).collect();
         Outcome {
             poses: (0..n)
-                .map(|k| (self.state.size(k) > stray).then(|| (self.state.island(k), self.state.pose[k])))
+                .map(|k| (self.state.size(k) > stray).then(|| (self.state.island(k), *self.state.pose(k))))
                 .collect(),
             support: self.edges.iter().map(|e| e.support).collect(),
             matings,
@@ -151,7 +151,7 @@ impl Assembler<'_> {
         let own = |k: &usize| {
             // All of the border where the pieces lie says more than the segment by which they were matched.
             let e = &self.edges[*k];
-            let b_from_a = self.state.pose[e.b].inverse() * self.state.pose[e.a];
+            let b_from_a = self.state.pose(e.b).inverse() * self.state.pose(e.a);
             let paper = self.params.policy == Policy::Paper;
             let contact = (!paper).then(|| self.contact_of(e.a, e.b, &b_from_a, FINE)).flatten();
             contact.map_or((self.joints[*k].fit.clearance, 0.0), |c| (c.clearance, c.variance))

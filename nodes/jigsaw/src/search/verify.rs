@@ -20,7 +20,7 @@ impl Assembler<'_> {
             let joined = self.joined_at();
             for island in self.state.islands() {
                 for (p, q) in self.neighbours(island) {
-                    let pose = self.state.pose[q].inverse() * self.state.pose[p];
+                    let pose = self.state.pose(q).inverse() * self.state.pose(p);
                     let area = self.memory.overlap(self.outlines[p], self.outlines[q], &pose);
                     if area <= OVERLAP * self.outlines[p].scale * self.outlines[q].scale {
                         continue;
@@ -111,9 +111,9 @@ impl Assembler<'_> {
         let joined = self.joined_at();
         let mut losers = Vec::new();
         for p in self.state.members(ia) {
-            let here = pose * self.state.pose[p];
+            let here = pose * self.state.pose(p);
             for q in self.state.members(ib) {
-                let q_from_p = self.state.pose[q].inverse() * here;
+                let q_from_p = self.state.pose(q).inverse() * here;
                 let area = self.memory.overlap(self.outlines[p], self.outlines[q], &q_from_p);
                 if area > self.tolerated() * self.outlines[p].scale * self.outlines[q].scale {
                     losers.push(if self.weight(&joined[p]) < self.weight(&joined[q]) { p } else { q });

@@ -44,7 +44,7 @@ impl Assembler<'_> {
         if most < LEAST * self.params.candidates {
             return false;
         }
-        let index = Index::new(tabs);
+        let index = Index::new(tabs, mouths.len());
         let known: HashSet<[Slot; 2]> = self.edges.iter().map(|e| e.slots).collect();
         let found: Vec<Vec<Joint>> = mouths
             .into_par_iter()
