@@ -100,6 +100,23 @@ fn a_spot_of_glare_on_the_ground() {
     check(&grey(&pixels), &necks, "glare");
 }
 
+/// The reflection of a lamp in a dark, glossy ground: spots and a streak, faint and so strong that the camera clips them.
+#[test]
+fn a_lamp_in_a_dark_ground() {
+    for strength in [60.0, 120.0, 225.0, 500.0] {
+        for (width, height) in [(25.0, 25.0), (35.0, 35.0), (18.0, 60.0)] {
+            let (mut pixels, necks) =
+                scene(Camera { shape_level: 180.0, ground_level: 30.0, noise: 3.0, ..Camera::default() });
+            for (k, p) in pixels.iter_mut().enumerate() {
+                let (x, y) = ((k % SIDE) as f64 - 445.0, (k / SIDE) as f64 - 450.0);
+                let glare = strength * (-0.5 * ((x / width).powi(2) + (y / height).powi(2))).exp();
+                *p = if *p > 110 { *p } else { p.saturating_add(glare as u8) };
+            }
+            check(&grey(&pixels), &necks, &format!("glare of {strength}, {width} x {height} px"));
+        }
+    }
+}
+
 #[test]
 fn a_ground_of_another_colour() {
     // Piece and ground are of the same brightness on the average of the channels.

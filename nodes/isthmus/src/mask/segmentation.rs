@@ -36,7 +36,7 @@ pub enum Reason {
     Small,
     /// It is a thread: a hair, the edge of the scanner's glass.
     Thread,
-    /// It differs far less from the ground than the other shapes, and without a crisp edge: glare, a shadow.
+    /// It has no crisp edge as the other shapes have, or differs far less from the ground: glare, a shadow.
     Faint,
     /// Two shapes touch.
     Touching,

@@ -4,7 +4,7 @@ use super::crop::Crop;
 use super::frame::Frame;
 use super::runs::Components;
 use super::segmentation::{Parameters, Reason, Rejected, Segmentation};
-use super::statistics::median;
+use super::statistics::{median, quantile};
 use crate::Point;
 use crate::contour::Border;
 use crate::cutout::Cutout;
@@ -42,6 +42,13 @@ const MAX_EDGE_REACH: f64 = 6.0;
 /// Least part of a shape's contrast that a crisp edge has within that reach: a spot of light has a sixth, an edge in focus all.
 const CRISP_EDGE: f64 = 0.6;
 
+/// Rows of a shape at whose ends its sharpness is looked at, about.
+const ROWS: usize = 16;
+/// How far on either side of its ends levels are compared there, in pixels: beyond the blur of pictures in focus, and within the margin of a cutout.
+const REACH: usize = 3;
+/// Shapes less sharp than this part of the sharpest are looked at once more: noise of an eighth of the contrast makes few such.
+const SOFT: f32 = 0.7;
+
 /// A shape that may still be rejected beside the others.
 pub(super) struct Found {
     pub(super) cutout: Cutout,
@@ -54,13 +61,24 @@ pub(super) struct Found {
     pub(super) is_convex: bool,
 }
 
-/// Rejects what is cut by the frame, or small or faint beside the other shapes, and convex beside such with bays; whether there are such.
+/// Rejects what is cut by the frame, or small, soft or faint beside the other shapes, and convex beside such with bays; whether there are such.
 pub(super) fn sift(
     frame: &Frame<'_>,
     parameters: &Parameters,
-    found: Vec<Found>,
+    mut found: Vec<Found>,
     mut rejected: Vec<Rejected>,
 ) -> (Segmentation, bool) {
+    let sharpness: Vec<f32> =
+        if found.len() > 1 { found.iter().map(|f| sharpness(&f.cutout)).collect() } else { Vec::new() };
+    let sharpest = sharpness.iter().copied().fold(0.0, f32::max);
+    let mut sharpness = sharpness.into_iter();
+    found.retain(|f| {
+        let is_soft = sharpness.next().is_some_and(|s| s < SOFT * sharpest) && !has_crisp_edge(&f.cutout);
+        if is_soft {
+            rejected.push(Rejected { aoi: f.cutout.aoi, area: f.area, reason: Reason::Faint });
+        }
+        !is_soft
+    });
     let total: usize = found.iter().map(|f| f.area).sum();
     let rim = 2 * (frame.width + frame.height);
     let is_tight = |f: &Found| {
@@ -152,6 +170,26 @@ pub(super) fn sift(
     cutouts.sort_by_key(|c| (c.aoi.y, c.aoi.x));
     rejected.sort_by_key(|r| (r.aoi.y, r.aoi.x));
     (Segmentation { cutouts, rejected, separated, shaded }, has_bays)
+}
+
+/// The step of the level at the ends of some of a shape's rows, as a part of the contrast: the upper quartile.
+fn sharpness(cutout: &Cutout) -> f32 {
+    let (width, height) = (cutout.window.width as usize, cutout.window.height as usize);
+    let contrast = cutout.shape_level - cutout.ground_level;
+    let level = |x: usize, y: usize| f32::from(cutout.pixels[y.min(height - 1) * width + x.min(width - 1)]);
+    let step = |x: usize, y: usize| {
+        let across = level(x + REACH, y) - level(x.saturating_sub(REACH), y);
+        let down = level(x, y + REACH) - level(x, y.saturating_sub(REACH));
+        across.abs().max(down.abs()) / contrast.abs()
+    };
+    let half = cutout.ground_level + contrast / 2.0;
+    let steps = (0..height).step_by((height / ROWS).max(1)).flat_map(|y| {
+        let row = &cutout.pixels[y * width..][..width];
+        let is_shape = |p: &u8| (f32::from(*p) > half) == (contrast > 0.0);
+        let ends = [row.iter().position(is_shape), row.iter().rposition(is_shape)];
+        ends.into_iter().flatten().map(move |x| (x, y))
+    });
+    quantile(&steps.map(|(x, y)| step(x, y)).collect::<Vec<_>>(), 0.75)
 }
 
 /// Whether the level falls off at the border of a shape rather than all over it: the edge of a piece, however faint, does, those of glare and
