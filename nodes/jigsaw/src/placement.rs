@@ -156,15 +156,16 @@ impl Quad {
     /// Moves the points and finds their feet near where they were: along the tangent, once. Rounds of refinement that
     /// follow one another take a foot to where it belongs (Newton's method, without a branch for each point).
     fn find(&mut self, run: &[Node], step: f32, (cos, sin, x, y): (f32, f32, f32, f32)) {
-        let most = run.len() - 2;
+        // Numbers of 32 bits are rounded side by side.
+        let most = run.len() as i32 - 2;
         let last = (most + 1) as f32;
         let half_spacing = 0.5 / step;
         for l in 0..LANES {
             self.px[l] = cos * self.x[l] - sin * self.y[l] + x;
             self.py[l] = sin * self.x[l] + cos * self.y[l] + y;
         }
-        let place = self.at.map(|at| (at as usize).min(most));
-        let node = place.map(|i| run[i]);
+        let place = self.at.map(|at| (at as i32).min(most));
+        let node = place.map(|i| run[i as usize]);
         let mut moved = [0.0; LANES];
         for l in 0..LANES {
             // Outward normals stand to the right of the running direction in an image, whose y points down.
@@ -172,8 +173,8 @@ impl Quad {
             moved[l] = place[l] as f32 + (along * step).clamp(-STRIDE, STRIDE);
             self.at[l] = moved[l].clamp(0.0, last);
         }
-        let place = self.at.map(|at| (at as usize).min(most));
-        let (here, next) = (place.map(|i| run[i]), place.map(|i| run[i + 1]));
+        let place = self.at.map(|at| (at as i32).min(most));
+        let (here, next) = (place.map(|i| run[i as usize]), place.map(|i| run[i as usize + 1]));
         for l in 0..LANES {
             let part = self.at[l] - place[l] as f32;
             let lerp = |p: f32, q: f32| p + (q - p) * part;
