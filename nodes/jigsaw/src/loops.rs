@@ -5,14 +5,14 @@
 //! agreement is chance. Three pieces round a corner (brickwork, mosaics) close the same way. A loop is a set of three
 //! or four candidates whose poses agree, each piece entering and leaving by different isthmuses.
 //!
-//! 1. *Distance*: how far a loop fails to close is measured against what its candidates leave open (Mahalanobis
+//! 1. *Misclosure*: how far a loop fails to close is measured against what its candidates leave open (Mahalanobis
 //!    distance; each candidate carries the covariance of its pose, transported round the loop). A tab that may slide
-//!    along its mouth is forgiven just that slide.
+//!    along its mouth is forgiven just that slide, and a worn joint, whose residuals are large, more than a good one.
 //! 2. *Chance*: the same search with one piece of each way exchanged for another one of the puzzle (decoys, as in the
 //!    target-decoy method of Elias and Gygi 2007) shows how many loops close by chance, and how closely. The more alike
 //!    the pieces are, the more do.
 //! 3. *Mixture*: in three degrees of freedom distances follow a Maxwell distribution, narrow for true loops and wide for
-//!    chance ones. The narrow one is fitted to this puzzle; the ratio of the two is the evidence of a loop.
+//!    chance ones, which know nothing of residuals. The narrow one is fitted to this puzzle; the ratio of the two is the evidence of a loop.
 //!
 //! Complexity O(pieces · degree²) for the two-step ways, which are compared only where they meet. Where no loops close
 //! (a strip, single joints) nothing is learnt, and what is known of the borders' noise has to serve.
@@ -36,6 +36,8 @@ pub(crate) struct Edge {
     /// What the contact leaves open of that pose: covariance of (x, y, turn) of `a` about the point `at`, both in the
     /// image of `b`, for border residuals of variance one.
     pub(crate) covariance: Matrix3<f64>,
+    /// Variance of the border residuals; about one.
+    pub(crate) variance: f64,
     pub(crate) at: Point,
     /// Logarithmic cost; less is better.
     pub(crate) cost: f64,
@@ -46,13 +48,47 @@ pub(crate) struct Edge {
     pub(crate) support: usize,
 }
 
-/// A closed loop: its candidates, the Mahalanobis distance by which it fails to close, and the evidence (natural
-/// logarithm of odds) that it doesn't close by chance.
+/// A closed loop: its candidates, by how much it fails to close, and the evidence (natural logarithm of odds) that it
+/// doesn't close by chance.
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) struct Loop {
     pub(crate) edges: Vec<usize>,
-    pub(crate) distance: f64,
+    pub(crate) misclosure: Misclosure,
     pub(crate) evidence: f64,
+}
+
+/// How far two poses of a piece that should be one are apart, measured against what candidates leave open of them
+/// (Mahalanobis distances).
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(crate) struct Misclosure {
+    /// As if all residuals had the same variance.
+    plain: f64,
+    /// With the candidates' own variances, and the logarithm of how much less these leave open, by volume.
+    own: f64,
+    narrower: f64,
+}
+
+/// What is open of a pose: as if all residuals had the same variance, and with the candidates' own ones.
+#[derive(Clone, Copy)]
+struct Spread {
+    plain: Matrix3<f64>,
+    own: Matrix3<f64>,
+}
+
+impl std::ops::Add for Spread {
+    type Output = Self;
+    fn add(self, other: Self) -> Self {
+        Self { plain: self.plain + other.plain, own: self.own + other.own }
+    }
+}
+
+impl Misclosure {
+    /// Its density among loops that are right, which close `scale` times as widely as their own residuals say, in the
+    /// measure of [`maxwell`].
+    fn density_if_right(&self, scale: f64) -> f64 {
+        let z = self.plain / scale;
+        (2.0 / std::f64::consts::PI).sqrt() * z * z / scale * (self.narrower - 0.5 * (self.own / scale).powi(2)).exp()
+    }
 }
 
 /// How far the two ways may differ: position in piece scales, angle in radians.
@@ -96,7 +132,7 @@ impl Tolerance {
 
 /// Pose of the piece `e.a` (or `e.b`) as seen from the other one, and what the candidate leaves open of it at
 /// `reference`, both in the frame of which `pose` tells how the piece left lies in it.
-fn step(e: &Edge, from: usize, pose: &Isometry2<f64>, reference: Point) -> (Isometry2<f64>, Matrix3<f64>) {
+fn step(e: &Edge, from: usize, pose: &Isometry2<f64>, reference: Point) -> (Isometry2<f64>, Spread) {
     let (step, rotation, at) = if e.b == from {
         (e.b_from_a, pose.rotation, e.at)
     } else {
@@ -104,11 +140,12 @@ fn step(e: &Edge, from: usize, pose: &Isometry2<f64>, reference: Point) -> (Isom
         (a_from_b, pose.rotation * a_from_b.rotation, a_from_b * e.at)
     };
     let motion = lever(pose * at, reference) * turned(rotation);
-    (pose * step, motion * e.covariance * motion.transpose())
+    let plain = motion * e.covariance * motion.transpose();
+    (pose * step, Spread { plain, own: plain * e.variance })
 }
 
 /// Covariance of where a way leads, at `reference`, both in the frame of the piece `start`.
-fn uncertainty(edges: &[Edge], start: usize, way: &Way, reference: Point) -> Matrix3<f64> {
+fn uncertainty(edges: &[Edge], start: usize, way: &Way, reference: Point) -> Spread {
     let (pose, first) = step(&edges[way.edges[0]], start, &Isometry2::identity(), reference);
     match way.via {
         Some(via) => first + step(&edges[way.edges[1]], via, &pose, reference).1,
@@ -116,11 +153,16 @@ fn uncertainty(edges: &[Edge], start: usize, way: &Way, reference: Point) -> Mat
     }
 }
 
-/// Mahalanobis distance of two poses of a point, given the sum of their covariances there.
-fn mahalanobis(p: &Isometry2<f64>, q: &Isometry2<f64>, point: Point, covariance: &Matrix3<f64>) -> f64 {
+/// How far two poses of a point are apart, given the sum of what is open of them there.
+fn misclosure(p: &Isometry2<f64>, q: &Isometry2<f64>, point: Point, open: &Spread) -> Misclosure {
     let d = p * point - q * point;
     let delta = Vector3::new(d.x, d.y, q.rotation.angle_to(&p.rotation));
-    covariance.cholesky().map_or(f64::INFINITY, |c| delta.dot(&c.solve(&delta)).max(0.0).sqrt())
+    let (Some(plain), Some(own)) = (open.plain.cholesky(), open.own.cholesky()) else {
+        return Misclosure { plain: f64::INFINITY, own: f64::INFINITY, narrower: 0.0 };
+    };
+    let distance = |c: &nalgebra::Cholesky<f64, nalgebra::Const<3>>| delta.dot(&c.solve(&delta)).max(0.0).sqrt();
+    let narrower = 0.5 * (plain.determinant() / own.determinant()).ln();
+    Misclosure { plain: distance(&plain), own: distance(&own), narrower }
 }
 
 /// What a candidate says about where one island lies in another.
@@ -133,17 +175,17 @@ pub(crate) struct Said<'a> {
     pub(crate) pose: Isometry2<f64>,
 }
 
-/// Mahalanobis distance of what two candidates between the same two islands say, at a point of the moving island.
-pub(crate) fn disagreement(p: &Said, q: &Said, point: Point) -> f64 {
+/// How far apart is what two candidates between the same two islands say, at a point of the moving island.
+pub(crate) fn disagreement(p: &Said, q: &Said, point: Point) -> Misclosure {
     let reference = q.pose * point;
-    let covariance = step(p.edge, p.from, &p.fixed, reference).1 + step(q.edge, q.from, &q.fixed, reference).1;
-    mahalanobis(&p.pose, &q.pose, point, &covariance)
+    let open = step(p.edge, p.from, &p.fixed, reference).1 + step(q.edge, q.from, &q.fixed, reference).1;
+    misclosure(&p.pose, &q.pose, point, &open)
 }
 
-/// Mahalanobis distance of what a candidate says from how its pieces lie, at a point of its piece `a`.
-pub(crate) fn deviation(edge: &Edge, b_from_a: &Isometry2<f64>, point: Point) -> f64 {
-    let (_, covariance) = step(edge, edge.b, &Isometry2::identity(), b_from_a * point);
-    mahalanobis(&edge.b_from_a, b_from_a, point, &covariance)
+/// How far what a candidate says is from how its pieces lie, at a point of its piece `a`.
+pub(crate) fn deviation(edge: &Edge, b_from_a: &Isometry2<f64>, point: Point) -> Misclosure {
+    let (_, open) = step(edge, edge.b, &Isometry2::identity(), b_from_a * point);
+    misclosure(&edge.b_from_a, b_from_a, point, &open)
 }
 
 /// The ways between pieces, and all it takes to see which of them close.
@@ -282,7 +324,7 @@ impl<'a> Ways<'a> {
                 let near = group[from..].iter().take_while(|(place, _)| place.x <= x + reach);
                 for (_, q) in near.filter(|(_, q)| q.edges != p.edges) {
                     if let Some(l) = self.join(a, &decoy, q) {
-                        found.distances.push(l.distance);
+                        found.distances.push(l.misclosure.plain);
                         found.akin += usize::from(self.join(a, p, q).is_some());
                     }
                 }
@@ -349,9 +391,9 @@ impl<'a> Ways<'a> {
             vec![p.edges[0], q.edges[0], p.edges[1], q.edges[1]]
         };
         let reference = p.pose * outline.centroid;
-        let covariance = uncertainty(self.edges, a, p, reference) + uncertainty(self.edges, a, q, reference);
-        let distance = mahalanobis(&p.pose, &q.pose, outline.centroid, &covariance);
-        Some(Loop { edges, distance, evidence: f64::NEG_INFINITY })
+        let open = uncertainty(self.edges, a, p, reference) + uncertainty(self.edges, a, q, reference);
+        let misclosure = misclosure(&p.pose, &q.pose, outline.centroid, &open);
+        Some(Loop { edges, misclosure, evidence: f64::NEG_INFINITY })
     }
 }
 
@@ -407,15 +449,15 @@ impl Closure {
         // than decoys are like them (a gamma distribution, its greatest value at what is expected).
         let known = (1.0 / expected + DECOY_DEVIATION * DECOY_DEVIATION).recip();
         let rate = ((decoys.akin as f64 + 1.0) / (OTHERS * sets * found.len() as f64 + 1.0)).clamp(guess.rate, 1.0);
-        let mut distances: Vec<f64> = found.iter().map(|l| l.distance).collect();
-        distances.sort_by(f64::total_cmp);
+        let mut distances: Vec<Misclosure> = found.iter().map(|l| l.misclosure).collect();
+        distances.sort_by(|p, q| p.plain.total_cmp(&q.plain));
         let stride = distances.len().div_ceil(LOOPS).max(1);
-        let distances: Vec<f64> = distances.into_iter().skip(stride / 2).step_by(stride).collect();
+        let distances: Vec<Misclosure> = distances.into_iter().skip(stride / 2).step_by(stride).collect();
         let share = distances.len() as f64 / found.len().max(1) as f64;
         let scales = |from: f64, to: f64| {
             std::iter::successors(Some(from), |s| Some(s * FINENESS)).take_while(move |s| *s <= to)
         };
-        let densities = |scale: f64| distances.iter().map(|z| maxwell(*z, scale)).collect::<Vec<f64>>();
+        let densities = |scale: f64| distances.iter().map(|z| maxwell(z.plain, scale)).collect::<Vec<f64>>();
         let reach = (3.0 * DECOY_DEVIATION).exp();
         let wides: Vec<(f64, Vec<f64>)> =
             scales(decoy_wide / reach, decoy_wide * reach).map(|s| (s, densities(s))).collect();
@@ -438,7 +480,7 @@ impl Closure {
         };
         let by_chance = wides.iter().map(by_chance).fold(f64::NEG_INFINITY, f64::max);
         for narrow in scales(guess.narrow * (-2.0 * GUESS_DEVIATION).exp(), decoy_wide * reach / LEAST_RATIO) {
-            let right_densities = densities(narrow);
+            let right_densities: Vec<f64> = distances.iter().map(|m| m.density_if_right(narrow)).collect();
             // Scales that are alike have counts that are: the next begin where the last have settled.
             let (mut right, mut chance) = (0.5 * distances.len() as f64, expected);
             for (wide, chance_densities) in wides.iter().filter(|w| w.0 >= LEAST_RATIO * narrow) {
@@ -472,29 +514,29 @@ impl Closure {
         best.1
     }
 
-    /// Logarithm of the odds that a loop which fails to close by `distance` is right.
-    pub(crate) fn evidence(&self, distance: f64) -> f64 {
-        let this = self.ratio(distance, self.narrow) + (self.right.max(f64::MIN_POSITIVE) / self.chance).ln();
+    /// Logarithm of the odds that a loop which fails to close by so much is right.
+    pub(crate) fn evidence(&self, misclosure: &Misclosure) -> f64 {
+        let this = self.ratio(misclosure, self.narrow) + (self.right.max(f64::MIN_POSITIVE) / self.chance).ln();
         // No loop is surer than that there are true ones.
         this.min(self.any)
     }
 
     /// Logarithm of how much likelier two candidates disagree by no more than `distance` if both are right than by
     /// chance.
-    pub(crate) fn agreement(&self, distance: f64) -> f64 {
-        self.ratio(distance, DRIFT * self.narrow) - self.rate.ln()
+    pub(crate) fn agreement(&self, misclosure: &Misclosure) -> f64 {
+        self.ratio(misclosure, DRIFT * self.narrow) - self.rate.ln()
     }
 
     /// Whether right candidates may disagree as much.
-    pub(crate) fn admits(&self, distance: f64) -> bool {
+    pub(crate) fn admits(&self, misclosure: &Misclosure) -> bool {
         /// A Maxwell distribution leaves one in 10⁵ beyond five times its scale.
         const BEYOND: f64 = 5.0;
-        distance <= BEYOND * DRIFT * self.narrow
+        misclosure.own <= BEYOND * DRIFT * self.narrow
     }
 
-    fn ratio(&self, distance: f64, narrow: f64) -> f64 {
-        let log = |scale: f64| -3.0 * scale.ln() - 0.5 * (distance / scale).powi(2);
-        log(narrow) - log(self.wide.max(narrow))
+    fn ratio(&self, misclosure: &Misclosure, narrow: f64) -> f64 {
+        let log = |distance: f64, scale: f64| -3.0 * scale.ln() - 0.5 * (distance / scale).powi(2);
+        misclosure.narrower + log(misclosure.own, narrow) - log(misclosure.plain, self.wide.max(narrow))
     }
 }
 
@@ -523,4 +565,23 @@ const MAXWELL_MEDIAN: f64 = 1.538;
 fn maxwell(distance: f64, scale: f64) -> f64 {
     let z = distance / scale;
     (2.0 / std::f64::consts::PI).sqrt() * z * z / scale * (-0.5 * z * z).exp()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// What is said of a loop of candidates of this variance that fails to close by so much.
+    fn evidence(variance: f64, offset: f64) -> f64 {
+        let open = Spread { plain: Matrix3::identity(), own: variance * Matrix3::identity() };
+        let [here, there] = [0.0, offset].map(|x| Isometry2::translation(x, 0.0));
+        let closure = Closure { narrow: 1.0, right: 1.0, wide: 10.0, chance: 1.0, rate: 1.0, any: f64::INFINITY };
+        closure.evidence(&misclosure(&here, &there, Point::origin(), &open))
+    }
+
+    #[test]
+    fn worn_joints_are_forgiven_more_and_prove_less() {
+        assert!(evidence(4.0, 4.0) > evidence(1.0, 4.0));
+        assert!(evidence(4.0, 0.5) < evidence(1.0, 0.5));
+    }
 }

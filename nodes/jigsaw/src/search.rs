@@ -82,6 +82,8 @@ struct Assembler<'a> {
     /// How many were given, and how many were found as contacts.
     given: usize,
     contacts: usize,
+    /// Usual residual of right candidates.
+    usual: f64,
     /// Candidates at each piece.
     at: Vec<Vec<usize>>,
     scale: f64,
@@ -120,8 +122,11 @@ pub(crate) fn assemble(
     let mut scales: Vec<f64> = outlines.iter().map(|o| o.scale).collect();
     let scale = *scales.select_nth_unstable_by(n / 2, f64::total_cmp).1;
     let slots = Slots::new(outlines);
-    let mut edges: Vec<Edge> = joints.iter().map(|j| edge(j, outlines, &slots)).collect();
+    let mut edges: Vec<Edge> = joints.iter().map(|j| edge(j, outlines, &slots, 1.0)).collect();
     rank(&mut edges, &slots);
+    let best = (0..edges.len()).filter(|k| edges[*k].mouth_rank == 0);
+    let usual = learn::median(&mut best.map(|k| joints[k].fit.residual).collect::<Vec<f64>>()).unwrap_or(1.0);
+    edges.iter_mut().zip(&joints).for_each(|(e, j)| e.variance = variance(j.fit.residual, usual));
     let mut at = vec![Vec::new(); n];
     for (k, e) in edges.iter().enumerate() {
         at[e.a].push(k);
@@ -134,6 +139,7 @@ pub(crate) fn assemble(
         memory,
         budget,
         given: joints.len(),
+        usual,
         joints,
         edges,
         contacts: 0,
@@ -161,8 +167,8 @@ pub(crate) fn assemble(
     }
 }
 
-/// A joint as the search sees it.
-fn edge(joint: &Joint, outlines: &[&Outline], slots: &Slots) -> Edge {
+/// A joint as the search sees it; `usual` is what residuals usually are.
+fn edge(joint: &Joint, outlines: &[&Outline], slots: &Slots, usual: f64) -> Edge {
     let Joint { a, tab, b, mouth, fit } = joint;
     Edge {
         a: *a,
@@ -170,12 +176,20 @@ fn edge(joint: &Joint, outlines: &[&Outline], slots: &Slots) -> Edge {
         slots: [slots.tab(*a, *tab), slots.mouth(*b, *mouth)],
         b_from_a: fit.negative_from_positive,
         covariance: covariance(&fit.information, outlines[*b].scale),
+        variance: variance(fit.residual, usual),
         at: outlines[*b].mouths[*mouth].origin,
         cost: fit.residual.max(1e-4).ln(),
         mouth_rank: 0,
         tab_rank: 0,
         support: 0,
     }
+}
+
+/// Variance of the residuals of a joint, in units of what is usual in the puzzle. One joint shows its own badly, for residuals
+/// hang together along the border; what is usual counts twice as much.
+fn variance(residual: f64, usual: f64) -> f64 {
+    const USUAL: f64 = 2.0;
+    ((residual / usual).powi(2) + USUAL) / (1.0 + USUAL)
 }
 
 /// Covariance of a pose, given what a contact tells about it; what it doesn't tell is known to a scale and a radian.

@@ -103,15 +103,15 @@ impl Assembler<'_> {
             if !FAR.allows(self.outlines[piece], &p, &q) {
                 continue;
             }
-            let distance = loops::disagreement(&said[i], &said[j], self.centre_of(piece));
+            let misclosure = loops::disagreement(&said[i], &said[j], self.centre_of(piece));
             let slots = e.slots;
             let clashes = |g: &usize| {
                 let taken = self.edges[*g].slots;
                 taken.iter().any(|s| slots.iter().any(|t| self.slots.conflict(*s, *t)))
             };
-            if self.closure.admits(distance) && !group.members.iter().any(clashes) {
+            if self.closure.admits(&misclosure) && !group.members.iter().any(clashes) {
                 group.members.push(*other);
-                group.evidence += single(*other) + self.closure.agreement(distance).clamp(0.0, STRONG);
+                group.evidence += single(*other) + self.closure.agreement(&misclosure).clamp(0.0, STRONG);
             }
         }
         group

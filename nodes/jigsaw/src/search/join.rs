@@ -78,7 +78,7 @@ impl Assembler<'_> {
         let actual = self.state.pose(e.b).inverse() * self.state.pose(e.a);
         let within = |t: Tolerance| t.allows(self.outlines[e.a], &actual, &e.b_from_a);
         within(MIN_AGREE)
-            || (within(AGREE) && self.closure.admits(loops::deviation(e, &actual, self.outlines[e.a].centroid)))
+            || (within(AGREE) && self.closure.admits(&loops::deviation(e, &actual, self.outlines[e.a].centroid)))
     }
 
     /// Joins the islands of a candidate; false if they contradict.

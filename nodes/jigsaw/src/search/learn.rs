@@ -44,8 +44,11 @@ impl Model {
 
     /// Logarithm of how much likelier a cost is for a right candidate than for the best wrong one of a mouth.
     pub(super) fn evidence(&self, cost: f64) -> f64 {
+        // Where wrong costs spread more than right ones, those of extreme candidates would look wrong again.
+        let [right, wrong] = [self.right, self.wrong].map(|(_, deviation)| deviation * deviation);
+        let best = self.right.0 - (self.wrong.0 - self.right.0) * right / (wrong - right).max(f64::MIN_POSITIVE);
         let density = |(mean, deviation): (f64, f64)| {
-            let z = (cost.max(self.right.0) - mean) / deviation;
+            let z = (cost.max(best) - mean) / deviation;
             -0.5 * z * z - f64::ln(deviation)
         };
         (density(self.right) - density(self.wrong)).clamp(-STRONG, STRONG)
@@ -268,7 +271,7 @@ impl Assembler<'_> {
 fn weigh(guess: &Closure, decoys: &loops::Decoys, found: &mut [loops::Loop]) -> Closure {
     let closure = Closure::fit(guess, found, decoys);
     for l in found {
-        l.evidence = l.evidence.max(closure.evidence(l.distance));
+        l.evidence = l.evidence.max(closure.evidence(&l.misclosure));
     }
     closure
 }
@@ -325,4 +328,24 @@ fn weighted_median(values: &mut [(f64, f64)]) -> f64 {
         }
     }
     0.0
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_greater_cost_is_never_better_evidence() {
+        for (right, wrong) in [((0.0, 0.4), (1.0, 0.4)), ((0.0, 0.3), (0.8, 0.7)), ((0.0, 0.2), (0.0, 0.2))] {
+            let model = Model::between(right, wrong);
+            let evidence: Vec<f64> = (-40..40).map(|k| model.evidence(0.1 * f64::from(k))).collect();
+            assert!(evidence.is_sorted_by(|p, q| p >= q), "{evidence:?}");
+        }
+    }
+
+    #[test]
+    fn a_better_joint_than_usual_counts_more() {
+        let model = Model::between((0.0, 0.4), (1.0, 0.5));
+        assert!(model.evidence(-0.4) > model.evidence(0.0));
+    }
 }

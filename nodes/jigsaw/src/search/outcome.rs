@@ -79,7 +79,7 @@ impl Assembler<'_> {
             };
             ends.into_iter().flat_map(|s| self.slots.rivals(s)).for_each(|s| settled[s.number] = true);
             let joint = Joint { a, tab, b, mouth, fit };
-            self.edges.push(edge(&joint, self.outlines, &self.slots));
+            self.edges.push(edge(&joint, self.outlines, &self.slots, self.usual));
             self.joints.push(joint);
             self.contacts += 1;
         }

@@ -78,7 +78,7 @@ impl Assembler<'_> {
         for joint in found.into_iter().flatten() {
             self.at[joint.a].push(self.edges.len());
             self.at[joint.b].push(self.edges.len());
-            self.edges.push(Edge { cost: self.cost(&joint), ..edge(&joint, self.outlines, &self.slots) });
+            self.edges.push(Edge { cost: self.cost(&joint), ..edge(&joint, self.outlines, &self.slots, self.usual) });
             self.joints.push(joint);
         }
         let any = self.edges.len() > before;
