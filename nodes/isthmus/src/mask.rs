@@ -92,7 +92,7 @@ impl Segmenter {
         self.blocks.fill(frame);
         // `self` is filled while the candidates are looked at.
         let blocks = std::mem::take(&mut self.blocks);
-        let mut best: Option<((bool, usize), Segmentation)> = None;
+        let mut found: Vec<(bool, Segmentation)> = Vec::new();
         for (candidate, is_told) in ground::candidates(&blocks) {
             let ground = ground::find(frame, &blocks, candidate, std::mem::take(&mut self.residual));
             let (segmentation, has_bays) = self.shapes(frame, &blocks, &ground, parameters);
@@ -101,16 +101,23 @@ impl Segmenter {
             let fills = |aoi: &Aoi| 2 * aoi.width as usize > frame.width && 2 * aoi.height as usize > frame.height;
             let is_sheet = |r: &Rejected| fills(&r.aoi) && (!has_bays || r.reason == Reason::Convex);
             let is_ground = |c: &Cutout| fills(&c.aoi) && !has_bays;
-            let is_sound = !segmentation.rejected.iter().any(is_sheet) && !segmentation.cutouts.iter().any(is_ground);
-            let area = segmentation.cutouts.iter().map(|c| c.aoi.width as usize * c.aoi.height as usize).sum();
-            if best.as_ref().is_none_or(|(best, _)| (is_sound, area) > *best) {
-                best = Some(((is_sound, area), segmentation));
-            }
-            if is_told && is_sound {
+            let has_sheet = segmentation.rejected.iter().any(is_sheet) || segmentation.cutouts.iter().any(is_ground);
+            found.push((has_sheet, segmentation));
+            if is_told && !has_sheet {
                 break;
             }
         }
         self.blocks = blocks;
+        // Unless there is nothing on it but its joints: then it is a solved puzzle.
+        let is_shown = found.iter().any(|(has_sheet, _)| *has_sheet);
+        let is_sound = |(has_sheet, s): &(bool, Segmentation)| !(*has_sheet || is_shown && are_lines(&s.cutouts));
+        let mut best: Option<((bool, usize), Segmentation)> = None;
+        for candidate in found {
+            let worth = (is_sound(&candidate), candidate.1.cutouts.iter().map(box_area).sum());
+            if best.as_ref().is_none_or(|(best, _)| worth > *best) {
+                best = Some((worth, candidate.1));
+            }
+        }
         best.map(|(_, segmentation)| segmentation).unwrap_or_default()
     }
 
@@ -213,4 +220,20 @@ impl Segmenter {
         })
         .sum()
     }
+}
+
+fn box_area(cutout: &Cutout) -> usize {
+    cutout.aoi.width as usize * cutout.aoi.height as usize
+}
+
+/// Whether shapes are lines, which fill little of their boxes: the joints of a solved puzzle.
+fn are_lines(cutouts: &[Cutout]) -> bool {
+    /// A piece fills half of its box and more, an arc a tenth.
+    const LEAST_FILL: f64 = 0.3;
+    let area = |c: &Cutout| {
+        let half = 0.5 * (c.shape_level + c.ground_level);
+        c.pixels.iter().filter(|p| (f32::from(**p) > half) == (c.shape_level > c.ground_level)).count()
+    };
+    let [filled, boxes] = [cutouts.iter().map(area).sum::<usize>(), cutouts.iter().map(box_area).sum()];
+    (filled as f64) < LEAST_FILL * boxes as f64
 }

@@ -375,6 +375,30 @@ fn walls_and_trays() {
     }
 }
 
+/// A solved puzzle that fills the frame up to a margin: joints show here and there.
+#[test]
+fn the_joints_of_a_sheet_are_no_shapes() {
+    for margin in [30.0, 50.0] {
+        let mut pixels = Camera { width: SIDE, height: SIDE, noise: 3.0, ..Camera::default() }.picture(&[]);
+        let ground = pixels[0];
+        let level = if ground > 128 { ground - 120 } else { ground + 120 };
+        for (k, pixel) in pixels.iter_mut().enumerate() {
+            let [x, y] = [k % SIDE, k / SIDE].map(|v| v as f64);
+            let inside = |v: f64| (margin..SIDE as f64 - margin).contains(&v);
+            let is_joint = |across: f64, along: f64| {
+                let shift = 15.0 * (along / 25.0).sin();
+                (across + shift).rem_euclid(200.0) < 3.0 && (along / 40.0 + (across / 200.0).floor()).sin() > 0.2
+            };
+            if inside(x) && inside(y) && !is_joint(x, y) && !is_joint(y, x) {
+                *pixel = level;
+            }
+        }
+        let found = grey(&pixels);
+        let spans: Vec<u32> = found.cutouts.iter().map(|c| c.aoi.width).collect();
+        assert!(spans.len() == 1 && spans[0] as usize > SIDE / 2, "margin {margin}: {spans:?}");
+    }
+}
+
 #[test]
 fn a_piece_that_the_frame_cuts_is_named() {
     let outlines: Vec<_> = [(230.0, 240.0), (650.0, 220.0), (240.0, 660.0), (880.0, 650.0)]
