@@ -10,8 +10,8 @@
 //!
 //! **For the sake of DDS Security.** RustDDS 0.15 reads the handshakes of all participants through a history of one message, and each
 //! participant sends its own to all, again and again in one go. Where several join together each overwrites what the
-//! others said, on a busy machine in the same order every second until they give up after ten, and the two do not hear each
-//! other until they have forgotten one another. Of one that joins alone at least one handshake gets through at
+//! others said, on a busy machine in the same order every second until they give up after ten, and the two never hear each
+//! other. Of one that joins alone at least one handshake gets through at
 //! a time. So a secured process has its turn until all whom it met have let it in.
 
 use std::fs::{File, OpenOptions, TryLockError};

@@ -86,8 +86,7 @@ impl Misclosure {
     /// Its density among loops that are right, which close `scale` times as widely as their own residuals say, in the
     /// measure of [`maxwell`].
     fn density_if_right(&self, scale: f64) -> f64 {
-        let z = self.plain / scale;
-        (2.0 / std::f64::consts::PI).sqrt() * z * z / scale * (self.narrower - 0.5 * (self.own / scale).powi(2)).exp()
+        shell(self.plain, scale) * (self.narrower - 0.5 * (self.own / scale).powi(2)).exp()
     }
 }
 
@@ -563,8 +562,13 @@ const MAXWELL_MEDIAN: f64 = 1.538;
 
 /// Density of the length of a vector of three normal deviates.
 fn maxwell(distance: f64, scale: f64) -> f64 {
+    shell(distance, scale) * (-0.5 * (distance / scale).powi(2)).exp()
+}
+
+/// What of that density doesn't fall off: the surface on which vectors of this length end.
+fn shell(distance: f64, scale: f64) -> f64 {
     let z = distance / scale;
-    (2.0 / std::f64::consts::PI).sqrt() * z * z / scale * (-0.5 * z * z).exp()
+    (2.0 / std::f64::consts::PI).sqrt() * z * z / scale
 }
 
 #[cfg(test)]
