@@ -39,12 +39,22 @@ fn grey(pixels: &[u8]) -> Segmentation {
 /// All four pieces are there, and all their necks where they belong.
 fn check(found: &Segmentation, necks: &[Neck], what: &str) {
     assert_eq!(found.cutouts.len(), CENTRES.len(), "{what}: {:?}", found.rejected);
+    check_levels(found, what);
     let mut extractor = Extractor::default();
     let isthmuses: Vec<_> = found.cutouts.iter().flat_map(|c| extractor.extract(c).unwrap().isthmuses).collect();
     for neck in necks {
         let same = isthmuses.iter().filter(|i| i.salient && i.polarity == neck.polarity);
         let off = same.map(|i| (i.point - neck.middle()).norm()).fold(f64::MAX, f64::min);
         assert!(off < MIDDLE, "{what}: {neck:?} is {off} px off");
+    }
+}
+
+/// Levels are those of 8 bits, whatever surfaces run through them.
+fn check_levels(found: &Segmentation, what: &str) {
+    for c in &found.cutouts {
+        for level in [c.shape_level, c.ground_level] {
+            assert!((0.0..=255.0).contains(&level), "{what}: a level of {level:e}");
+        }
     }
 }
 
@@ -63,6 +73,25 @@ fn dark_on_light_and_light_on_dark() {
     for (shape_level, ground_level) in [(40.0, 215.0), (215.0, 40.0), (100.0, 140.0), (140.0, 100.0), (0.0, 255.0)] {
         let (pixels, necks) = scene(Camera { shape_level, ground_level, noise: 3.0, ..Camera::default() });
         check(&grey(&pixels), &necks, &format!("{shape_level} on {ground_level}"));
+    }
+}
+
+/// Silhouettes without levels between, many to a frame and one each in tight frames without a margin.
+#[test]
+fn one_bit_silhouettes() {
+    for (shape_level, ground_level) in [(0.0, 255.0), (255.0, 0.0)] {
+        let what = format!("{shape_level} on {ground_level}");
+        let (mut pixels, necks) = scene(Camera { shape_level, ground_level, ..Camera::default() });
+        pixels.iter_mut().for_each(|p| *p = if *p < 128 { 0 } else { 255 });
+        let found = grey(&pixels);
+        check(&found, &necks, &what);
+        for aoi in found.cutouts.iter().map(|c| c.aoi) {
+            let rows = pixels.chunks_exact(SIDE).skip(aoi.y as usize).take(aoi.height as usize);
+            let tight: Vec<u8> = rows.flat_map(|r| &r[aoi.x as usize..][..aoi.width as usize]).copied().collect();
+            let found = segment(&Frame::grey(aoi.width, aoi.height, &tight).unwrap(), &Parameters::default());
+            assert_eq!(found.cutouts.len(), 1, "{what}, tight: {:?}", found.rejected);
+            check_levels(&found, &what);
+        }
     }
 }
 

@@ -62,9 +62,7 @@ impl Crop {
         self.contrast = levels.contrast;
         let plain = levels.is_uniform() && frame.format == PixelFormat::Grey;
         if plain {
-            self.ground_level = levels.ground;
-            // A sum of rounded numbers; a level is one of the 8-bit scale.
-            self.shape_level = (levels.ground + levels.sense * levels.contrast).clamp(0.0, 255.0);
+            (self.shape_level, self.ground_level) = (levels.ground + levels.sense * levels.contrast, levels.ground);
         } else if levels.is_uniform() {
             (self.shape_level, self.ground_level) = (levels.contrast, 0.0);
         } else {
@@ -72,6 +70,10 @@ impl Crop {
             let noise = ground.scatter * block as f32 / levels.contrast.max(f32::MIN_POSITIVE);
             let contrast = (127.5 / (0.5 + DIVIDED_ROOM * noise)).min(MAX_DIVIDED_CONTRAST);
             (self.shape_level, self.ground_level) = (127.5 + contrast / 2.0, 127.5 - contrast / 2.0);
+        }
+        // Sums of rounded numbers, and surfaces through them, may lie beyond the 8-bit scale; no pixel does.
+        for level in [&mut self.shape_level, &mut self.ground_level] {
+            *level = level.clamp(0.0, 255.0);
         }
         let ground_pixel = self.ground_pixel();
         // Each pixel is written below.
