@@ -44,8 +44,9 @@ const MAX_ISTHMUSES: usize = 1000;
 /// Share by which the length of the border in the message may differ from that of its points.
 const LENGTH_TOLERANCE: f64 = 0.05;
 
-/// By how much of its width the end of an isthmus may lie off the place on the border that is told: far more than borders
-/// sampled in another way differ by, far less than it is to any other isthmus.
+/// By how much of its width the end of an isthmus may lie off the place on the border that is told (or by the distance of
+/// two border points, where that is more): far more than borders sampled in another way differ by, far less than it is to
+/// any other isthmus.
 const PLACE_TOLERANCE: f64 = 0.25;
 
 /// Share by which the scales of two pieces may differ.
@@ -224,7 +225,8 @@ pub fn piece(message: &PieceFeatures) -> Result<(Piece, Sighting), FeaturesError
     let agrees = (told - length).abs() <= LENGTH_TOLERANCE * length;
     check("border_length_px", agrees, &told, &format!("{length:.1}, the length of the border"))?;
     check("isthmuses length", message.isthmuses.len() <= MAX_ISTHMUSES, &message.isthmuses.len(), &MAX_ISTHMUSES)?;
-    let border = Border { spacing: length / points.len() as f64, points };
+    // Places on the border are told in the length that is told, which between two points may follow a curve.
+    let border = Border { spacing: told / points.len() as f64, points };
     for isthmus in &message.isthmuses {
         check_isthmus(isthmus, told, &check)?;
         check_place(isthmus, &border, &check)?;
@@ -289,7 +291,7 @@ fn check_place(isthmus: &IsthmusMessage, border: &Border, check: &Check<'_>) -> 
     let [first, last] = isthmus.arc_px.map(f64::from);
     for (arc, point) in [first, last].into_iter().zip(&isthmus.critical_points_px) {
         let distance = (border.point_at(arc) - Point::new(point.x.into(), point.y.into())).norm();
-        let near = distance <= PLACE_TOLERANCE * f64::from(isthmus.width_px);
+        let near = distance <= border.spacing.max(PLACE_TOLERANCE * f64::from(isthmus.width_px));
         let rule = format!("where the critical point ({}, {}) lies on the border", point.x, point.y);
         check("isthmuses.arc_px", near, &arc, &rule)?;
     }
