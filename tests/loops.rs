@@ -16,6 +16,7 @@ use jigsaw_msgs::builtin_interfaces::msg::{Duration, Time};
 use jigsaw_msgs::geometry_msgs::msg::Pose;
 use jigsaw_msgs::msg::{Assembly, PieceFeatures, PieceImage};
 use jigsaw_msgs::sensor_msgs::msg::{CompressedImage, Image};
+use jigsaw_msgs::std_msgs::msg::Header;
 use jigsaw_msgs::std_srvs::srv::{Trigger, TriggerRequest, TriggerResponse};
 use jigsaw_msgs::tf2_msgs::msg::TFMessage;
 use jigsaw_msgs::visualization_msgs::msg::{Marker, MarkerArray};
@@ -172,6 +173,50 @@ fn frames_become_poses_that_agree_with_the_truth() {
     };
     // The origin of the puzzle frame is its bottom left corner.
     assert!(low(|p| p.x).abs() < 1e-12 && low(|p| p.y).abs() < 1e-12);
+}
+
+/// A picture file as a camera would send it.
+fn photograph(file: &std::path::Path, stamp: Time) -> Image {
+    let picture = image::open(file).unwrap();
+    let (width, height) = (picture.width(), picture.height());
+    let (encoding, data) = if picture.color().has_color() {
+        ("rgb8", picture.into_rgb8().into_raw())
+    } else {
+        ("mono8", picture.into_luma8().into_raw())
+    };
+    let header = Header { stamp, frame_id: "camera".to_owned() };
+    Image { header, height, width, encoding: encoding.into(), is_bigendian: 0, step: data.len() as u32 / height, data }
+}
+
+/// Each message says of each real piece what the next node takes. Skipped where the scans are missing.
+#[test]
+fn real_pieces_are_refused_by_no_node() {
+    let folder = std::env::var_os("JIGSAW_SCANS").map_or_else(
+        || std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("../shared/scans"),
+        std::path::PathBuf::from,
+    );
+    if !folder.is_dir() {
+        println!("skipped: no scans");
+        return;
+    }
+    for (set, count) in [("eda12", 12), ("patch16", 16), ("toystory48", 48), ("white120", 120), ("horse208", 208)] {
+        let folder = [folder.join(set).join("pieces"), folder.join(set)].into_iter().find(|f| f.is_dir()).unwrap();
+        let files = std::fs::read_dir(folder).unwrap().map(|entry| entry.unwrap().path());
+        let is_scan = |file: &std::path::PathBuf| {
+            let name = file.file_name().unwrap().to_string_lossy();
+            [".png", ".jpg", ".jpeg", ".tiff"].iter().any(|end| name.ends_with(end)) && !name.contains("solved")
+        };
+        let mut files: Vec<_> = files.filter(is_scan).collect();
+        files.sort();
+        let stamp = |k: usize| Time { sec: k as i32, nanosec: 0 };
+        let frames = files.iter().enumerate().map(|(k, f)| Frame::Raw(TOPIC.to_owned(), photograph(f, stamp(k))));
+        let health = health();
+        let features = run_feature(run_capture(frames.collect(), Vec::new(), &health), &health);
+        assert_eq!((features.len(), health.refusals()), (count, 0), "{set}");
+        for message in &features {
+            solver::convert::piece(message).unwrap_or_else(|refusal| panic!("{set}: {refusal}"));
+        }
+    }
 }
 
 #[test]

@@ -6,6 +6,7 @@
 //! known piece of the same camera is that piece. A camera's frames may come on two topics, raw and compressed.
 
 use std::collections::{HashMap, VecDeque};
+use std::ops::Range;
 
 use isthmus::mask::{Aoi, Cutout};
 
@@ -70,6 +71,9 @@ const FRAMES_KEPT: usize = 8192;
 /// Pieces whose places are remembered; four times the largest common puzzle.
 const PIECES_KEPT: usize = 4096;
 
+/// Bits of a word, as a number of columns.
+const WORD: i32 = u64::BITS as i32;
+
 /// The name of a cutout, and whether it is to be published.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Admission {
@@ -90,11 +94,15 @@ pub struct Known {
     places: VecDeque<Place>,
 }
 
+/// Where a piece was seen: a bit a pixel, in words that begin at multiples of 64 columns of the frame, so that those of two
+/// pieces lie over each other.
 #[derive(Debug)]
 struct Place {
     id: String,
     camera: String,
-    aoi: Aoi,
+    /// The words across, and the rows.
+    words: Range<i32>,
+    rows: Range<i32>,
     bits: Vec<u64>,
     area: u32,
 }
@@ -135,7 +143,7 @@ impl Known {
 
     fn admit_place(&mut self, source: &str, id: String, cutout: &Cutout, overlap: f64) -> Admission {
         let place = Place::new(id, source, cutout);
-        if let Some(known) = self.places.iter().find(|known| known.overlap(&place) >= overlap) {
+        if let Some(known) = self.places.iter().find(|known| known.overlaps(&place, overlap)) {
             return Admission { id: known.id.clone(), publish: false };
         }
         let id = place.id.clone();
@@ -164,25 +172,30 @@ impl Known {
 
 impl Place {
     fn new(id: String, source: &str, cutout: &Cutout) -> Self {
-        let Aoi { width, height, .. } = cutout.aoi;
+        let Aoi { x, y, width, height } = cutout.aoi;
+        let right = x + width as i32;
+        let words = x.div_euclid(WORD)..right.div_euclid(WORD) + 1;
         let mut place = Self {
             id,
             camera: camera(source).to_owned(),
-            aoi: cutout.aoi,
-            bits: vec![0; (width as usize * height as usize).div_ceil(64)],
+            bits: vec![0; words.len() * height as usize],
+            words,
+            rows: y..y + height as i32,
             area: 0,
         };
         let threshold = (cutout.shape_level + cutout.ground_level) / 2.0;
         let bright = cutout.shape_level > cutout.ground_level;
-        let left = (cutout.aoi.x - cutout.window.x).max(0) as usize;
-        let top = (cutout.aoi.y - cutout.window.y).max(0) as usize;
-        for row in 0..height as usize {
+        let left = (x - cutout.window.x).max(0) as usize;
+        let top = (y - cutout.window.y).max(0) as usize;
+        let before = x.rem_euclid(WORD) as usize;
+        let lines = place.bits.chunks_exact_mut(place.words.len());
+        for (row, line) in lines.enumerate() {
             let start = (top + row) * cutout.window.width as usize + left;
             let Some(pixels) = cutout.pixels.get(start..start + width as usize) else { break };
             for (column, &pixel) in pixels.iter().enumerate() {
                 if (f32::from(pixel) > threshold) == bright {
-                    let bit = row * width as usize + column;
-                    place.bits[bit / 64] |= 1 << (bit % 64);
+                    let bit = before + column;
+                    line[bit / WORD as usize] |= 1 << (bit % WORD as usize);
                     place.area += 1;
                 }
             }
@@ -190,41 +203,28 @@ impl Place {
         place
     }
 
-    fn covers(&self, x: i32, y: i32) -> bool {
-        let (column, row) = (x - self.aoi.x, y - self.aoi.y);
-        if column < 0 || row < 0 || column as u32 >= self.aoi.width || row as u32 >= self.aoi.height {
+    /// Whether the area that both cover is at least this share of what either covers, for the same camera.
+    fn overlaps(&self, other: &Self, share: f64) -> bool {
+        let (smaller, larger) = (self.area.min(other.area), self.area.max(other.area));
+        // The share can't exceed the ratio of the areas, by which most pieces differ.
+        if self.camera != other.camera || smaller == 0 || f64::from(smaller) < share * f64::from(larger) {
             return false;
         }
-        let bit = row as usize * self.aoi.width as usize + column as usize;
-        self.bits[bit / 64] >> (bit % 64) & 1 == 1
+        let common = |a: &Range<i32>, b: &Range<i32>| a.start.max(b.start)..a.end.min(b.end);
+        let words = common(&self.words, &other.words);
+        if words.is_empty() {
+            return false;
+        }
+        let in_row = |y| self.line(y, &words).iter().zip(other.line(y, &words)).map(|(a, b)| (a & b).count_ones());
+        let both: u32 = common(&self.rows, &other.rows).flat_map(in_row).sum();
+        f64::from(both) >= share * f64::from(self.area + other.area - both)
     }
 
-    /// Intersection over union of the two areas; 0 for pieces of different cameras.
-    fn overlap(&self, other: &Self) -> f64 {
-        let (smaller, larger) = (self.area.min(other.area), self.area.max(other.area));
-        // The overlap can't exceed the ratio of the areas; the boxes must meet to have one at all.
-        if self.camera != other.camera || smaller == 0 || !meet(&self.aoi, &other.aoi) || smaller < larger / 2 {
-            return 0.0;
-        }
-        let mut both = 0_u32;
-        for y in self.aoi.y..self.aoi.y + self.aoi.height as i32 {
-            for x in self.aoi.x..self.aoi.x + self.aoi.width as i32 {
-                both += u32::from(self.covers(x, y) && other.covers(x, y));
-            }
-        }
-        f64::from(both) / f64::from(self.area + other.area - both)
+    /// Some of the words of a row.
+    fn line(&self, y: i32, words: &Range<i32>) -> &[u64] {
+        let start = (y - self.rows.start) as usize * self.words.len() + (words.start - self.words.start) as usize;
+        &self.bits[start..start + words.len()]
     }
-}
-
-/// Whether most of two boxes is common to both.
-fn meet(a: &Aoi, b: &Aoi) -> bool {
-    let common = |a0: i32, a1: u32, b0: i32, b1: u32| {
-        let (a0, b0) = (i64::from(a0), i64::from(b0));
-        (a0 + i64::from(a1)).min(b0 + i64::from(b1)) - a0.max(b0)
-    };
-    let half = |length: u32| i64::from(length / 2);
-    common(a.x, a.width, b.x, b.width) > half(a.width.max(b.width))
-        && common(a.y, a.height, b.y, b.height) > half(a.height.max(b.height))
 }
 
 #[cfg(test)]
@@ -286,6 +286,24 @@ mod tests {
         let other = known.admit(&other_camera, 5, &[disc(100, 100, 60)], OVERLAP);
         let all = [&other_size[0].id, &other_way[1].id, &other[0].id];
         assert!(other[0].publish && all[0] != all[1] && all[0] != all[2] && all[1] != all[2], "{all:?}");
+    }
+
+    #[test]
+    fn areas_are_compared_pixel_by_pixel() {
+        const RADIUS: i32 = 40;
+        let is_within = |x: i32, y: i32| x * x + y * y <= RADIUS * RADIUS;
+        // Wherever the words of a row begin.
+        for (x, shift) in (60..130).flat_map(|x| (0..4).map(move |shift| (x, shift))) {
+            let [here, there] = [x, x + shift].map(|x| Place::new("p".into(), "/image", &disc(x, 100, RADIUS)));
+            let pixels = (-RADIUS..=RADIUS).flat_map(|v| (-RADIUS..=RADIUS + shift).map(move |u| (u, v)));
+            let [mut both, mut either] = [0_u32; 2];
+            for (u, v) in pixels {
+                both += u32::from(is_within(u, v) && is_within(u - shift, v));
+                either += u32::from(is_within(u, v) || is_within(u - shift, v));
+            }
+            let share = f64::from(both) / f64::from(either);
+            assert!(here.overlaps(&there, share - 1e-9) && !here.overlaps(&there, share + 1e-9), "{x} {shift}");
+        }
     }
 
     #[test]
