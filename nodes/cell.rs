@@ -10,8 +10,9 @@ use std::process::ExitCode;
 use futures::channel::mpsc;
 use futures::future;
 
+use crate::ros::exit::{ProcessError, exit_code};
 use crate::ros::params::Spec;
-use crate::ros::process::{self, Process, ProcessError, Program, Work};
+use crate::ros::process::{Process, Program, Work};
 use crate::ros::session::{CHANNEL_DEPTH, Session};
 use crate::{capture, feature, solver};
 
@@ -48,7 +49,7 @@ pub fn run(args: CellArgs) -> ExitCode {
         process.only_ros_arguments()?;
         process.composed_of(TABLES).started_again().run(open)
     });
-    process::exit_code(NAME, result)
+    exit_code(NAME, result)
 }
 
 fn node(process: &mut Process, program: Program) -> Result<Session, ProcessError> {

@@ -21,7 +21,8 @@ use nalgebra::{Isometry2, Point2, Vector2};
 use serde_json::{Value, json};
 
 use crate::console::{complain, say};
-use crate::ros::process::{Process, exit_code};
+use crate::ros::exit::exit_code;
+use crate::ros::process::Process;
 use crate::ros::session::{Session, SessionError};
 use crate::ros::topics;
 use crate::ros::transforms::PixelPlane;

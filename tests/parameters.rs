@@ -7,8 +7,9 @@
 
 use std::path::Path;
 
+use jigsaw_nodes::ros::node_params::COMMON_PARAMETERS;
 use jigsaw_nodes::ros::params::{Spec, markdown, show, yaml};
-use jigsaw_nodes::ros::process::{COMMON_PARAMETERS, Program};
+use jigsaw_nodes::ros::process::Program;
 use jigsaw_nodes::{capture, feature, solver};
 
 const PROGRAMS: [Program; 3] = [capture::PROGRAM, feature::PROGRAM, solver::PROGRAM];

@@ -18,8 +18,8 @@ use jigsaw_nodes::bag::{BagReader, BagWriter, QosProfile, Selection, Storage, To
 use jigsaw_nodes::capture::convert::{FrameHead, Pixels, picture, piece_message};
 use jigsaw_nodes::capture::source::Frame;
 use jigsaw_nodes::ros::args::RosArgs;
+use jigsaw_nodes::ros::node_params::COMMON_PARAMETERS;
 use jigsaw_nodes::ros::params::Parameters;
-use jigsaw_nodes::ros::process::COMMON_PARAMETERS;
 use jigsaw_nodes::{capture, feature, solver};
 
 /// Largest picture that is looked at after it was read, in pixels: enough for every branch, little enough to be quick.

@@ -16,7 +16,8 @@ use super::qos::{Durability, QosProfile, Reliability};
 use super::record::{RecordError, RecordEvent, RecordOptions, RequestedTopic, record};
 use super::{BagReader, BagWriter, Compression, Storage, WriterOptions};
 use crate::console::{complain, say};
-use crate::ros::process::{Process, ProcessError, exit_code};
+use crate::ros::exit::{ProcessError, exit_code};
+use crate::ros::process::Process;
 
 /// Exit code for bad input.
 const BAD_INPUT: u8 = 2;

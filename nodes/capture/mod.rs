@@ -21,10 +21,11 @@ use jigsaw_msgs::std_msgs::msg::Empty;
 use jigsaw_msgs::std_srvs::srv::{Trigger, TriggerResponse};
 
 use crate::ros::activity::WhileInactive;
+use crate::ros::exit::ProcessError;
 use crate::ros::health::Health;
 use crate::ros::lifecycle::Forget;
 use crate::ros::params::Parameters;
-use crate::ros::process::{ProcessError, Program, Work};
+use crate::ros::process::{Program, Work};
 use crate::ros::session::{Call, Session, Settings};
 use crate::ros::topics;
 use convert::{FrameError, FrameHead};

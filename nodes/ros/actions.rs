@@ -19,8 +19,9 @@ use jigsaw_msgs::{Action, Message};
 use rustdds::{QosPolicies, TopicKind};
 use serde::{Deserialize, Serialize};
 
+use super::clock::Clock;
 use super::health::Health;
-use super::session::{CHANNEL_DEPTH, Clock, Session, SessionError};
+use super::session::{CHANNEL_DEPTH, Session, SessionError};
 use super::topics::{FEEDBACK_QOS, STATUS_QOS};
 
 /// How long a result is kept, as `rcl_action` does.

@@ -1,5 +1,9 @@
 //! What discovery tells of the endpoints of this process: who listens, who asks for or offers too little, who shakes
 //! hands, and who comes back after it was forgotten.
+//!
+//! **Whoever was forgotten and comes back** (a link was down for longer than the lease, 50 s) stays a stranger: RustDDS
+//! has taken its announcements of endpoints once and takes them for known when they come again. A node that sees that ends;
+//! with its new identity both sides find each other as new.
 
 use std::collections::{HashMap, HashSet, VecDeque};
 use std::sync::{Arc, Mutex, PoisonError};

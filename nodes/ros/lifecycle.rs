@@ -29,9 +29,11 @@ use jigsaw_msgs::lifecycle_msgs::srv::{
 };
 
 use super::activity::Activity;
+use super::clock::Clock;
+use super::exit::ProcessError;
 use super::health::{Health, shown};
-use super::process::{AUTOSTART, ProcessError};
-use super::session::{Clock, Session};
+use super::node_params::AUTOSTART;
+use super::session::Session;
 use super::topics::TRANSITION_EVENT;
 
 /// The wish that a node's loop forget what it has seen; to be answered when it has.

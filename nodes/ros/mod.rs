@@ -1,6 +1,6 @@
 //! Middleware glue: everything that knows DDS, and nothing that knows jigsaw puzzles beyond the names of the topics.
 //!
-//! Arrows point one way: [`process`] opens a [`session`]; what a session can do beyond topics ([`actions`], [`kept`],
+//! Arrows point one way: [`process`] joins its domain (`participant`) and opens [`session`]s; what a session can do beyond topics ([`actions`], [`kept`],
 //! [`lifecycle`], [`raw`], `server`, [`services`]) stands beside it and is not known to it.
 //!
 //! | module | what stands there, and nowhere else |
@@ -23,7 +23,12 @@
 //! | [`peers`] | discovery without multicast |
 //! | `farewell` | says that a process leaves |
 //! | `turn` | the processes of a host join a domain one after the other |
-//! | [`process`] | one process: signals, participant, watchdog, exit code |
+//! | `participant` | how a process joins its domain and leaves it: interfaces, static peers, security |
+//! | [`process`] | one process: signals, nodes, end |
+//! | `watchdog` | a process that has gone deaf, or whose loop stands still |
+//! | [`exit`] | why a process ends, and its exit code |
+//! | [`node_params`] | the parameters that every node has |
+//! | [`clock`] | the system's time, or that of `/clock` |
 //! | [`logging`] | log lines to the console and `/rosout`, throttled warnings |
 //! | [`health`] | counters of a node, published as `/diagnostics` |
 //! | [`transforms`] | pixels (y down) to metres (y up) |
@@ -31,7 +36,9 @@
 pub mod actions;
 pub mod activity;
 pub mod args;
+pub mod clock;
 pub mod discovery;
+pub mod exit;
 mod farewell;
 pub mod health;
 pub mod kept;
@@ -39,7 +46,9 @@ mod large;
 pub mod lifecycle;
 pub mod logging;
 mod missed;
+pub mod node_params;
 pub mod params;
+mod participant;
 pub mod peers;
 pub mod process;
 pub mod raw;
@@ -50,3 +59,4 @@ pub mod session;
 pub mod topics;
 pub mod transforms;
 mod turn;
+mod watchdog;

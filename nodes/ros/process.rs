@@ -1,117 +1,38 @@
-//! One process: command line, signals, DDS participant, nodes, watchdog, exit code.
-//!
-//! | exit code | meaning |
-//! | --- | --- |
-//! | 0 | ended by SIGINT or SIGTERM, or done |
-//! | 1 | the middleware could not be opened |
-//! | 2 | bad command line, parameter or environment; one line says what |
-//! | 3 | the node had gone deaf, or to some (see below), and is to be started again |
+//! One process: command line, signals, participant, nodes, watchdogs, end.
 //!
 //! **Signals** are blocked on every thread, and one thread waits for them. A handler that ran on one of RustDDS's own
-//! threads would interrupt its poll, after which that thread ends for good and the node lives on deaf. SIGSTOP and
-//! SIGCONT interrupt polls all the same; so a **watchdog** looks whether RustDDS's threads still live and ends the
-//! process where one has gone, so that whoever started it starts it again. Another one does the same where the process's own loop
-//! stands still, in a call of the middleware that does not return; and an end waits for the middleware's threads with
-//! a limit.
+//! threads would interrupt its poll, after which that thread ends for good and the node lives on deaf.
 //!
-//! **Whoever was forgotten and comes back** (a link was down for longer than the lease, 50 s) stays a stranger: RustDDS
-//! has taken its announcements of endpoints once and takes them for known when they come again. A node that sees that ends
-//! as well; with its new identity both sides find each other as new.
+//! A process ends when its work is done, at a signal, and where it is to be [started again](super::exit).
 
 use std::cell::RefCell;
-use std::net::{IpAddr, Ipv4Addr};
-use std::path::Path;
 use std::process::ExitCode;
 use std::rc::Rc;
-use std::sync::atomic::{AtomicU64, Ordering};
-use std::sync::mpsc::{self, RecvTimeoutError};
+use std::sync::atomic::AtomicU64;
 use std::sync::{Arc, Mutex, PoisonError, Weak};
 use std::time::Duration;
 
 use futures::channel::oneshot;
 use futures::future::LocalBoxFuture;
 use futures::{FutureExt, SinkExt, StreamExt};
-use jigsaw_msgs::builtin_interfaces::msg::Time;
 use jigsaw_msgs::diagnostic_msgs::msg::DiagnosticArray;
 use jigsaw_msgs::std_msgs::msg::Header;
 use nix::sys::resource::{Resource, getrlimit, setrlimit};
 use nix::sys::signal::{SigSet, Signal};
 use ros2_client::{Context, NodeName, NodeOptions};
-use rustdds::{DomainParticipant, DomainParticipantBuilder, RTPSEntity};
 
 use super::activity::Activity;
-use super::args::{ArgsError, RosArgs, domain_id};
-use super::discovery::{Endpoints, Estranged};
-use super::farewell::Farewell;
+use super::args::RosArgs;
+use super::clock::Clock;
+use super::discovery::{self, Endpoints};
+use super::exit::{ProcessError, exit_code, told};
 use super::health::Health;
-use super::params::{Default as DefaultValue, ParameterError, Parameters, Rule, Spec};
-use super::session::{Clock, Session, SessionError};
-use super::turn::Turn;
-use super::{discovery, logging, peers, security, services, topics};
-use crate::console::{complain, say};
-
-/// Whether a node starts to work by itself.
-pub const AUTOSTART: Spec = Spec {
-    name: "autostart",
-    default: DefaultValue::Bool(true),
-    unit: "",
-    rule: Rule::Any,
-    description: "Configure and activate the node when it starts; otherwise it waits, unconfigured, for a lifecycle manager.",
-    read_only: true,
-};
-
-/// Whether the time comes from `/clock`.
-pub const USE_SIM_TIME: Spec = Spec {
-    name: "use_sim_time",
-    default: DefaultValue::Bool(false),
-    unit: "",
-    rule: Rule::Any,
-    description: "Take the time from /clock instead of the system.",
-    read_only: false,
-};
-
-/// Which interfaces the middleware uses.
-pub const NETWORK_INTERFACES: Spec = Spec {
-    name: "network_interfaces",
-    default: DefaultValue::Texts(&[]),
-    unit: "",
-    rule: Rule::Texts("IP addresses of this host", |text| text.parse::<IpAddr>().is_ok()),
-    description: "Addresses of the network interfaces to talk through; all of them if empty, 127.0.0.1 for this host alone.",
-    read_only: true,
-};
-
-/// How much memory the process may take.
-pub const MAXIMUM_MEMORY: Spec = Spec {
-    name: "maximum_memory",
-    default: DefaultValue::Integer(4096),
-    unit: "MiB",
-    rule: Rule::Integers(0, 1 << 20),
-    description: "Address space that the process may take; beyond it ends, to be started again, so that malformed network \
-                  packets can't take all memory; 0 for no limit.",
-    read_only: true,
-};
-
-/// Hosts that multicast does not reach.
-pub const STATIC_PEERS: Spec = Spec {
-    name: "static_peers",
-    default: DefaultValue::Texts(&[]),
-    unit: "",
-    rule: Rule::Texts("IPv4 addresses", |text| text.parse::<Ipv4Addr>().is_ok()),
-    description: "Addresses of hosts that this process announces itself to by unicast, for networks without multicast; \
-                  to be set on all hosts. Without, the environment's ROS_STATIC_PEERS is taken (separated by ';').",
-    read_only: true,
-};
-
-/// The parameters every node has.
-pub const COMMON_PARAMETERS: &[Spec] = &[AUTOSTART, USE_SIM_TIME, NETWORK_INTERFACES, MAXIMUM_MEMORY, STATIC_PEERS];
-
-/// How often the watchdog looks.
-const WATCH_PERIOD: Duration = Duration::from_millis(500);
-
-/// How many looks of the watchdog the process's loop may stand still: long beyond any work that is done in it, opening
-/// the middleware on a busy machine included. Looks and not seconds, so that a process that was stopped is not taken
-/// for one that hangs.
-const LOOKS: u32 = 60;
+use super::node_params::{COMMON_PARAMETERS, MAXIMUM_MEMORY};
+use super::params::{Parameters, Spec};
+use super::participant::Participant;
+use super::session::{Session, SessionError};
+use super::{logging, services, topics, watchdog};
+use crate::console::say;
 
 /// How often a node reports.
 const REPORT_PERIOD: Duration = Duration::from_secs(1);
@@ -119,58 +40,6 @@ const REPORT_PERIOD: Duration = Duration::from_secs(1);
 /// How long an ordered end may take after a signal; then the process ends anyway, so that whoever sent the signal
 /// need not kill it.
 const END_PATIENCE: Duration = Duration::from_millis(800);
-
-/// How long the middleware may take to end; what it has not done by then is left to the end of the process.
-const MIDDLEWARE_PATIENCE: Duration = Duration::from_secs(5);
-
-/// Beginning of the names of RustDDS's threads.
-const MIDDLEWARE_THREADS: &str = "RustDDS";
-
-/// Why a process ends, other than by a signal.
-#[derive(Debug, thiserror::Error)]
-#[non_exhaustive]
-pub enum ProcessError {
-    /// The command line or the environment.
-    #[error(transparent)]
-    Args(#[from] ArgsError),
-    /// A parameter's start-up value.
-    #[error(transparent)]
-    Parameter(#[from] ParameterError),
-    /// The configuration of a node, beyond the rules of single parameters.
-    #[error("{0}")]
-    Configuration(String),
-    /// The middleware, or a name.
-    #[error(transparent)]
-    Session(#[from] SessionError),
-    /// The system.
-    #[error("{what}: {reason}")]
-    System {
-        /// What was tried.
-        what: &'static str,
-        /// The system's words.
-        reason: String,
-    },
-    /// A thread of the middleware has ended.
-    #[error("the middleware has gone deaf (its thread '{0}' ended, as it does after SIGSTOP); start this node again")]
-    Deaf(String),
-    /// A call does not return.
-    #[error("the node's loop has stood still for {} s; start this node again", (WATCH_PERIOD * LOOKS).as_secs())]
-    Stalled,
-    /// One that was forgotten has come back.
-    #[error(transparent)]
-    Estranged(#[from] Estranged),
-}
-
-impl ProcessError {
-    /// The exit code of the process.
-    pub fn exit_code(&self) -> u8 {
-        match self {
-            Self::Args(_) | Self::Parameter(_) | Self::Configuration(_) | Self::Session(SessionError::Name(_)) => 2,
-            Self::Session(_) | Self::System { .. } => 1,
-            Self::Deaf(_) | Self::Stalled | Self::Estranged(_) => 3,
-        }
-    }
-}
 
 /// What a program is, for `--help`.
 #[derive(Debug, Clone, Copy)]
@@ -204,20 +73,6 @@ pub fn main(program: Program, open: impl FnOnce(Session) -> Result<Work, Process
     exit_code(program.name, result)
 }
 
-/// Says what went wrong, in one line, and gives the exit code for it.
-pub fn exit_code(program: &str, result: Result<(), ProcessError>) -> ExitCode {
-    match result {
-        Ok(()) => ExitCode::SUCCESS,
-        Err(error) => told(program, &error).into(),
-    }
-}
-
-/// Says what went wrong, and gives the exit code for it.
-fn told(program: &str, error: &ProcessError) -> u8 {
-    complain!("{program}: {error}");
-    error.exit_code()
-}
-
 fn help(program: &Program) -> String {
     let mut text = format!(
         "{}\n\nUsage: {} [--ros-args [-r FROM:=TO] [-p NAME:=VALUE] [--params-file FILE]\n       \
@@ -247,11 +102,8 @@ pub struct Process {
     name: &'static str,
     executor: Rc<smol::LocalExecutor<'static>>,
     endpoints: Endpoints,
-    participant: Option<(DomainParticipant, Context)>,
-    /// Held until this process has joined the domain.
-    turn: Option<Turn>,
-    /// Said at the end.
-    farewell: Option<Farewell>,
+    /// Which all nodes share; opened with the first of them.
+    participant: Option<Participant>,
     /// Where the work is told that a signal has come, if it wants to end itself.
     ending: Arc<Mutex<Option<oneshot::Sender<()>>>>,
     /// The parameters of all nodes of a composed process: one that another node has is no mistake.
@@ -277,8 +129,6 @@ impl Process {
             executor: Rc::new(smol::LocalExecutor::new()),
             endpoints: Endpoints::default(),
             participant: None,
-            turn: None,
-            farewell: None,
             ending: Arc::default(),
             tables: &[],
             started_again: false,
@@ -322,7 +172,7 @@ impl Process {
         }
         table.start_with(&overrides)?;
         logging::add_node(name, &names);
-        let context = self.context(&table)?;
+        let (context, secured) = self.context(&table)?;
         let node_name = NodeName::new(names.namespace(), names.name())
             .map_err(|e| SessionError::middleware(format!("node {}", names.full_name()), e))?;
         // Parameters are served from our own table; the library's services know neither ranges nor descriptions.
@@ -338,14 +188,16 @@ impl Process {
             names,
             executor: Rc::clone(&self.executor),
             endpoints: self.endpoints.clone(),
-            secured: self.farewell.is_none(),
+            secured,
             parameters: table,
             health,
             clock: Clock::default(),
             activity: Activity::default(),
         };
         services::open(&mut session)?;
-        follow_clock(&mut session)?;
+        let ticks = session.subscribe(&topics::CLOCK)?;
+        let Session { parameters, health, clock, .. } = &session;
+        session.spawn(clock.clone().follow(ticks, Arc::clone(parameters), Arc::clone(health)));
         report(&mut session)?;
         Ok(session)
     }
@@ -367,11 +219,10 @@ impl Process {
         let rounds = Arc::new(AtomicU64::new(0));
         self.end_when_stalled(Arc::downgrade(&rounds))?;
         let work = open(&mut self)?;
-        let participant = self.participant.as_ref().map(|(participant, _)| participant.clone());
+        let participant = self.participant.as_ref().map(|joined| joined.participant.clone());
         let discovery = discovery::follow(participant, self.endpoints.clone(), self.started_again);
-        if let Some(turn) = self.turn.take() {
-            let endpoints = self.endpoints.clone();
-            self.executor.spawn(turn.done(move || endpoints.handshakes())).detach();
+        if let Some(participant) = &mut self.participant {
+            self.executor.spawn(participant.let_others_join(self.endpoints.clone())).detach();
         }
         log::info!("{} is ready", self.name);
         let executor = Rc::clone(&self.executor);
@@ -379,27 +230,20 @@ impl Process {
             futures::select! {
                 result = work.fuse() => result,
                 _ = signalled.fuse() => Ok(()),
-                error = watchdog(&rounds).fuse() => Err(error),
+                thread = watchdog::ended_thread(&rounds).fuse() => Err(ProcessError::Deaf(thread)),
                 estranged = Box::pin(discovery).fuse() => Err(estranged.into()),
             }
         }));
         logging::remove_nodes();
-        let farewell = self.farewell.take();
-        let leave = || {
-            if let Some(Err(e)) = farewell.as_ref().map(Farewell::say) {
-                log::debug!("nobody was told of the end: {e}");
-            }
-        };
+        let participant = self.participant.take();
         if let Err(error @ ProcessError::Deaf(_)) = &result {
-            // A dead participant can't be taken down in order; its drop would wait for the dead thread.
-            leave();
+            participant.iter().for_each(Participant::leave_as_it_is);
             std::process::exit(told(self.name, error).into());
         }
-        // When nothing of it is left that could announce itself once more.
-        let participant = self.participant.take();
         drop((executor, self));
-        take_down(participant);
-        leave();
+        if let Some(participant) = participant {
+            participant.leave();
+        }
         result
     }
 
@@ -428,54 +272,24 @@ impl Process {
     fn end_when_stalled(&self, rounds: Weak<AtomicU64>) -> Result<(), ProcessError> {
         let name = self.name;
         start_thread("watchdog", move || {
-            let (mut last, mut looks) = (0, 0);
-            while let Some(rounds) = rounds.upgrade() {
-                let now = rounds.load(Ordering::Relaxed);
-                looks = if now == last { looks + 1 } else { 0 };
-                last = now;
-                if looks > LOOKS {
-                    std::process::exit(told(name, &ProcessError::Stalled).into());
-                }
-                drop(rounds);
-                std::thread::sleep(WATCH_PERIOD);
+            if watchdog::stands_still(&rounds, || std::thread::sleep(watchdog::PERIOD)) {
+                std::process::exit(told(name, &ProcessError::Stalled).into());
             }
         })
     }
 
-    /// The DDS participant, which all nodes of the process share; opened with the parameters of the first of them.
-    fn context(&mut self, parameters: &Parameters) -> Result<Context, ProcessError> {
-        if let Some((_, context)) = &self.participant {
-            return Ok(context.clone());
-        }
-        limit_memory(parameters)?;
-        let domain = domain_id(std::env::var("ROS_DOMAIN_ID").ok().as_deref())?;
-        let mut builder = DomainParticipantBuilder::new(domain);
-        let addresses = interfaces(parameters, |variable| std::env::var(variable).ok())?;
-        if !addresses.is_empty() {
-            log::debug!("network interfaces: {addresses:?}");
-            builder = builder.with_only_networks(addresses.iter().copied());
-        }
-        let enclave = security::enclave(self.args.enclave.as_deref(), |variable| std::env::var(variable).ok())?;
-        let is_secured = enclave.is_some();
-        if let Some(enclave) = enclave {
-            builder = secured(builder, &enclave);
-        }
-        let peers = static_peers(parameters, std::env::var("ROS_STATIC_PEERS").ok())?;
-        let system = |e: std::io::Error| ProcessError::System { what: "listening to discovery", reason: e.to_string() };
-        // Opened before the participant, so that its first announcement is heard.
-        let courier =
-            if peers.is_empty() { None } else { Some(peers::Courier::open(domain, &addresses).map_err(system)?) };
-        self.turn = Some(Turn::take(domain, is_secured));
-        let participant = builder.build().map_err(|e| SessionError::middleware(format!("DDS domain {domain}"), e))?;
-        if let Some(courier) = courier {
-            log::debug!("static peers: {peers:?}");
-            courier.serve(participant.guid(), peers.clone()).map_err(system)?;
-        }
-        self.farewell = (!is_secured).then(|| Farewell::of(participant.guid(), domain, addresses, peers));
-        let context = Context::from_domain_participant(participant.clone())
-            .map_err(|e| SessionError::middleware(format!("DDS domain {domain}"), e))?;
-        self.participant = Some((participant, context.clone()));
-        Ok(context)
+    /// The client library's view of the participant, and whether what it sends is encrypted. It is opened with the parameters of
+    /// the first node.
+    fn context(&mut self, parameters: &Parameters) -> Result<(Context, bool), ProcessError> {
+        let joined = match self.participant.take() {
+            Some(joined) => joined,
+            None => {
+                limit_memory(parameters)?;
+                Participant::join(parameters, self.args.enclave.as_deref())?
+            }
+        };
+        let joined = self.participant.insert(joined);
+        Ok((joined.context.clone(), joined.secured))
     }
 }
 
@@ -486,21 +300,6 @@ fn signals() -> SigSet {
     signals
 }
 
-/// The participant's builder with the files of an enclave.
-#[cfg(feature = "security")]
-fn secured(builder: DomainParticipantBuilder, enclave: &Path) -> DomainParticipantBuilder {
-    use rustdds::DomainParticipantSecurityConfigFiles as Files;
-    log::info!("secured by the enclave {}", enclave.display());
-    // The keys of SROS2 have no password.
-    builder.builtin_security(Files::with_ros_default_names(enclave, String::new()))
-}
-
-/// Without the feature there is never an enclave.
-#[cfg(not(feature = "security"))]
-fn secured(builder: DomainParticipantBuilder, _: &Path) -> DomainParticipantBuilder {
-    builder
-}
-
 /// Sets the limit of the address space, unless a lower one is in force.
 fn limit_memory(parameters: &Parameters) -> Result<(), ProcessError> {
     let failed = |e: nix::Error| ProcessError::System { what: "limiting the memory", reason: e.to_string() };
@@ -509,84 +308,6 @@ fn limit_memory(parameters: &Parameters) -> Result<(), ProcessError> {
     };
     let (_, hard) = getrlimit(Resource::RLIMIT_AS).map_err(failed)?;
     setrlimit(Resource::RLIMIT_AS, (limit << 20).min(hard), hard).map_err(failed)
-}
-
-/// The addresses that the parameter or the environment restricts the middleware to; none for no restriction.
-fn interfaces(
-    parameters: &Parameters,
-    environment: impl Fn(&'static str) -> Option<String>,
-) -> Result<Vec<IpAddr>, ArgsError> {
-    let loopback = vec![IpAddr::from([127, 0, 0, 1])];
-    let given: Vec<IpAddr> =
-        parameters.texts(&NETWORK_INTERFACES).iter().filter_map(|text| text.parse().ok()).collect();
-    if !given.is_empty() {
-        return Ok(given);
-    }
-    if environment("ROS_LOCALHOST_ONLY").as_deref() == Some("1") {
-        return Ok(loopback);
-    }
-    match environment("ROS_AUTOMATIC_DISCOVERY_RANGE").as_deref() {
-        None | Some("" | "SUBNET" | "SYSTEM_DEFAULT") => Ok(Vec::new()),
-        Some("LOCALHOST" | "OFF") => Ok(loopback),
-        Some(other) => Err(ArgsError::Environment {
-            variable: "ROS_AUTOMATIC_DISCOVERY_RANGE",
-            value: other.to_owned(),
-            rule: "must be one of SUBNET, LOCALHOST, OFF, SYSTEM_DEFAULT",
-        }),
-    }
-}
-
-/// The hosts to announce this process to, of the parameter or the environment.
-fn static_peers(parameters: &Parameters, environment: Option<String>) -> Result<Vec<Ipv4Addr>, ArgsError> {
-    let given: Vec<Ipv4Addr> = parameters.texts(&STATIC_PEERS).iter().filter_map(|text| text.parse().ok()).collect();
-    if !given.is_empty() {
-        return Ok(given);
-    }
-    let texts = environment.unwrap_or_default();
-    let texts = texts.split(';').map(str::trim).filter(|text| !text.is_empty());
-    texts
-        .map(|text| {
-            text.parse().map_err(|_| ArgsError::Environment {
-                variable: "ROS_STATIC_PEERS",
-                value: text.to_owned(),
-                rule: "must be IPv4 addresses, separated by ';'",
-            })
-        })
-        .collect()
-}
-
-/// Keeps the session's clock at `/clock` while `use_sim_time` is set.
-fn follow_clock(session: &mut Session) -> Result<(), SessionError> {
-    let mut ticks = session.subscribe(&topics::CLOCK)?;
-    const NANOS: u32 = 1_000_000_000;
-    let (clock, parameters) = (session.clock.clone(), Arc::clone(&session.parameters));
-    let health = Arc::clone(&session.health);
-    let mut changes = parameters.changes();
-    let simulated = parameters.bool(&USE_SIM_TIME);
-    clock.set(simulated.then(Default::default));
-    session.spawn(async move {
-        loop {
-            futures::select! {
-                tick = ticks.next() => match tick {
-                    Some(tick) if tick.clock.sec < 0 || tick.clock.nanosec >= NANOS => {
-                        let Time { sec, nanosec } = tick.clock;
-                        health.refuse("clock", &format!(
-                            "/clock: {sec} s and {nanosec} ns: must be 0 s or more, and less than {NANOS} ns"
-                        ));
-                    }
-                    Some(tick) if parameters.bool(&USE_SIM_TIME) => clock.set(Some(tick.clock)),
-                    Some(_) => {}
-                    None => break,
-                },
-                change = changes.next() => match (change, parameters.bool(&USE_SIM_TIME)) {
-                    (None, _) => break,
-                    (Some(()), false) => clock.set(None),
-                    (Some(()), true) => clock.begin_simulation(),
-                },
-            }
-        }
-    });
-    Ok(())
 }
 
 /// Publishes the session's report.
@@ -608,40 +329,4 @@ fn report(session: &mut Session) -> Result<(), SessionError> {
 fn start_thread(name: &str, work: impl FnOnce() + Send + 'static) -> Result<(), ProcessError> {
     let started = std::thread::Builder::new().name(name.to_owned()).spawn(work);
     started.map(drop).map_err(|e| ProcessError::System { what: "starting a thread", reason: e.to_string() })
-}
-
-/// Drops the participant and so ends its threads; waits for them, but not without limit.
-fn take_down(participant: Option<(DomainParticipant, Context)>) {
-    let (gone, ended) = mpsc::channel::<()>();
-    let dropping = start_thread("take down", move || drop((participant, gone)));
-    if dropping.is_ok() && ended.recv_timeout(MIDDLEWARE_PATIENCE) == Err(RecvTimeoutError::Timeout) {
-        log::warn!("the middleware has not ended after {} s and is left to itself", MIDDLEWARE_PATIENCE.as_secs());
-    }
-}
-
-/// Counts the rounds of the process's loop; resolves when a thread of the middleware has ended.
-async fn watchdog(rounds: &AtomicU64) -> ProcessError {
-    let mut known = middleware_threads();
-    loop {
-        smol::Timer::after(WATCH_PERIOD).await;
-        rounds.fetch_add(1, Ordering::Relaxed);
-        let alive = middleware_threads();
-        if let Some((_, name)) = known.iter().find(|thread| !alive.contains(thread)) {
-            return ProcessError::Deaf(name.clone());
-        }
-        known = alive;
-    }
-}
-
-/// Number and name of the threads of the middleware in this process; empty where the system doesn't tell.
-fn middleware_threads() -> Vec<(String, String)> {
-    let Ok(tasks) = std::fs::read_dir("/proc/self/task") else { return Vec::new() };
-    tasks
-        .flatten()
-        .filter_map(|task| {
-            let name = std::fs::read_to_string(task.path().join("comm")).ok()?;
-            let number = task.file_name().to_string_lossy().into_owned();
-            name.starts_with(MIDDLEWARE_THREADS).then(|| (number, name.trim_end().to_owned()))
-        })
-        .collect()
 }

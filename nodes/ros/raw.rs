@@ -17,15 +17,13 @@ use rustdds::{QosPolicies, QosPolicyBuilder, RTPSEntity, RepresentationIdentifie
 
 use super::discovery::Audience;
 use super::session::{Session, SessionError};
+use super::topics::TOPIC_PREFIX;
 
 /// Length of the header: two bytes representation identifier, two bytes options.
 const HEADER_LEN: usize = 4;
 
 /// Messages that may wait between the middleware and whoever takes them.
 const CHANNEL_DEPTH: usize = 16;
-
-/// Prefix of the DDS names of ROS topics.
-pub(super) const TOPIC_PREFIX: &str = "rt";
 
 /// Prefix that DDS puts before the name of a ROS message type, after its package.
 const DDS_TYPE_PART: &str = "::msg::dds_::";

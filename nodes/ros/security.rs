@@ -11,6 +11,8 @@
 
 use std::path::{Path, PathBuf};
 
+use rustdds::DomainParticipantBuilder;
+
 use super::args::ArgsError;
 
 /// The files of an enclave, as SROS2 names them.
@@ -42,6 +44,21 @@ pub(super) fn enclave(
             Ok(None)
         }
     }
+}
+
+/// The participant's builder with the files of an enclave.
+#[cfg(feature = "security")]
+pub(super) fn secure(builder: DomainParticipantBuilder, enclave: &Path) -> DomainParticipantBuilder {
+    use rustdds::DomainParticipantSecurityConfigFiles as Files;
+    log::info!("secured by the enclave {}", enclave.display());
+    // The keys of SROS2 have no password.
+    builder.builtin_security(Files::with_ros_default_names(enclave, String::new()))
+}
+
+/// Without the feature there is never an enclave.
+#[cfg(not(feature = "security"))]
+pub(super) fn secure(builder: DomainParticipantBuilder, _: &Path) -> DomainParticipantBuilder {
+    builder
 }
 
 fn whole_enclave(name: &str, keystore: Option<String>) -> Result<PathBuf, ArgsError> {

@@ -13,9 +13,10 @@ use ros2_client::rcl_interfaces::{
 };
 use ros2_client::{Message, ParameterValue, Publisher, builtin_interfaces};
 
+use super::clock::Clock;
 use super::health::Health;
 use super::params::Parameters;
-use super::session::{Clock, Session, SessionError};
+use super::session::{Session, SessionError};
 
 /// Opens the services of a node's parameters.
 pub(super) fn open(session: &mut Session) -> Result<(), SessionError> {

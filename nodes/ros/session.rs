@@ -10,18 +10,17 @@ use std::sync::Arc;
 
 use futures::channel::{mpsc, oneshot};
 use futures::{SinkExt, StreamExt};
-use jigsaw_msgs::builtin_interfaces::msg::Time;
 use jigsaw_msgs::{Message, Service};
 use ros2_client::{Context, MessageInfo, MessageTypeName, Node, QosProfile, Subscription};
 use rustdds::{GUID, RTPSEntity};
 
 use super::activity::Activity;
 use super::args::{ArgsError, NodeNames};
+use super::clock::Clock;
 use super::discovery::{Audience, Endpoints, LesserWriter, Offer};
 use super::health::Health;
 use super::params::Parameters;
-use super::raw::TOPIC_PREFIX;
-use super::topics::Topic;
+use super::topics::{TOPIC_PREFIX, Topic};
 
 /// Messages that may wait between the middleware and a node's loop. Few: what waits further out waits in the
 /// middleware's cache, whose depth is the topic's.
@@ -68,36 +67,6 @@ pub struct Settings {
     pub health: Arc<Health>,
     /// Whether the node works.
     pub activity: Activity,
-}
-
-/// What time it is: that of the system, or the last of `/clock` under `use_sim_time`.
-#[derive(Debug, Clone, Default)]
-pub struct Clock {
-    simulated: Rc<RefCell<Option<Time>>>,
-}
-
-impl Clock {
-    /// The time now. Zero under `use_sim_time` until `/clock` was heard, as in ROS.
-    pub fn now(&self) -> Time {
-        const NANOS: i64 = 1_000_000_000;
-        if let Some(time) = self.simulated.borrow().as_ref() {
-            return time.clone();
-        }
-        let nanos = ros2_client::builtin_interfaces::Time::now().to_nanos();
-        Time {
-            sec: i32::try_from(nanos.div_euclid(NANOS)).unwrap_or(i32::MAX),
-            nanosec: u32::try_from(nanos.rem_euclid(NANOS)).unwrap_or_default(),
-        }
-    }
-
-    pub(super) fn set(&self, time: Option<Time>) {
-        *self.simulated.borrow_mut() = time;
-    }
-
-    /// Goes over to simulated time, unless it has it already.
-    pub(super) fn begin_simulation(&self) {
-        self.simulated.borrow_mut().get_or_insert_default();
-    }
 }
 
 /// An open node.

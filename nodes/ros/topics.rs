@@ -14,6 +14,9 @@ use jigsaw_msgs::visualization_msgs::msg::MarkerArray;
 use ros2_client::QosProfile;
 use ros2_client::qos::{Durability, History, WhenFull};
 
+/// Prefix of the DDS names of ROS topics.
+pub(super) const TOPIC_PREFIX: &str = "rt";
+
 /// A topic.
 #[derive(Debug)]
 pub struct Topic<M> {

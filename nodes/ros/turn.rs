@@ -25,7 +25,7 @@ const ECHO: Duration = Duration::from_millis(100);
 /// stopped.
 const PATIENCE: Duration = Duration::from_secs(3);
 
-/// The same where processes are secured; less than a loop may stand still (`LOOKS` of [`super::process`]).
+/// The same where processes are secured; less than a loop may stand still ([`super::watchdog`]).
 const SECURED_PATIENCE: Duration = Duration::from_secs(20);
 
 /// How long a secured process waits to be met: by then the others have heard its announcement and answered with theirs, on a
@@ -42,7 +42,6 @@ const LOOK: Duration = Duration::from_millis(5);
 #[derive(Debug)]
 pub(super) struct Turn {
     lock: Option<File>,
-    secured: bool,
 }
 
 impl Turn {
@@ -56,26 +55,26 @@ impl Turn {
             Ok(file) => file,
             Err(e) => {
                 log::debug!("endpoints are opened without waiting for other processes: {}: {e}", path.display());
-                return Self { lock: None, secured };
+                return Self { lock: None };
             }
         };
         let end = Instant::now() + if secured { SECURED_PATIENCE } else { PATIENCE };
         loop {
             match file.try_lock() {
-                Ok(()) => return Self { lock: Some(file), secured },
+                Ok(()) => return Self { lock: Some(file) },
                 Err(TryLockError::WouldBlock) if Instant::now() < end => std::thread::sleep(LOOK),
-                Err(_) => return Self { lock: None, secured },
+                Err(_) => return Self { lock: None },
             }
         }
     }
 
-    /// To be called when the endpoints are open: gives the turn back when others may join. `handshakes` tells with how many
-    /// participants this one is shaking hands.
-    pub(super) async fn done(self, handshakes: impl Fn() -> usize) {
+    /// To be called when the endpoints are open: gives the turn back when others may join. `handshakes` tells, where the process
+    /// is secured, with how many participants it is shaking hands.
+    pub(super) async fn done(self, handshakes: Option<impl Fn() -> usize>) {
         if self.lock.is_none() {
             return;
         }
-        if self.secured {
+        if let Some(handshakes) = handshakes {
             let end = Instant::now() + HANDSHAKES;
             smol::Timer::after(ENCOUNTER).await;
             while handshakes() > 0 && Instant::now() < end {
@@ -90,14 +89,16 @@ impl Turn {
 mod tests {
     use std::cell::Cell;
 
+    use super::super::watchdog;
     use super::*;
 
     /// Domains that no test runs a node in.
     const DOMAIN: u16 = 231;
     const SECURED_DOMAIN: u16 = 232;
 
-    /// When the next one had its turn, after the first was done under these circumstances.
-    fn next_turn(domain: u16, secured: bool, handshakes: impl Fn() -> usize) -> Duration {
+    /// When the next one had its turn, after the first was done; both are secured where handshakes are counted.
+    fn next_turn(domain: u16, handshakes: Option<impl Fn() -> usize>) -> Duration {
+        let secured = handshakes.is_some();
         let first = Turn::take(domain, secured);
         assert!(first.lock.is_some());
         let next = std::thread::spawn(move || {
@@ -113,14 +114,19 @@ mod tests {
 
     #[test]
     fn a_turn_is_given_on() {
-        assert!(next_turn(DOMAIN, false, || usize::MAX) >= ECHO);
+        assert!(next_turn(DOMAIN, None::<fn() -> usize>) >= ECHO);
     }
 
     #[test]
     fn a_secured_turn_lasts_until_all_have_let_it_in() {
         let left = Cell::new(5_usize);
         let handshakes = || left.replace(left.get().saturating_sub(1));
-        assert!(next_turn(SECURED_DOMAIN, true, handshakes) >= ENCOUNTER);
+        assert!(next_turn(SECURED_DOMAIN, Some(handshakes)) >= ENCOUNTER);
         assert_eq!(left.get(), 0);
+    }
+
+    #[test]
+    fn waiting_for_the_turn_is_not_taken_for_standing_still() {
+        assert!(PATIENCE.max(SECURED_PATIENCE) < watchdog::PATIENCE);
     }
 }
