@@ -151,10 +151,19 @@ impl Endpoints {
         self.with(|table| table.handshakes.len())
     }
 
+    #[cfg(any(feature = "security", test))]
+    fn handshake_began(&self, participant: GUID, now: Instant) {
+        self.with(|table| table.handshakes.insert(participant, now));
+    }
+
+    fn handshake_ended(&self, participant: GUID) {
+        self.with(|table| table.handshakes.remove(&participant));
+    }
+
     /// One that takes too long to shake hands, and since when; it is not told of again.
-    fn take_overdue_handshake(&self) -> Option<(GUID, Instant)> {
+    fn take_overdue_handshake(&self, now: Instant) -> Option<(GUID, Instant)> {
         self.with(|table| {
-            let overdue = table.handshakes.iter().find(|(_, since)| since.elapsed() > HANDSHAKE_PATIENCE);
+            let overdue = table.handshakes.iter().find(|(_, since)| now.duration_since(**since) > HANDSHAKE_PATIENCE);
             let id = *overdue?.0;
             table.handshakes.remove_entry(&id)
         })
@@ -185,6 +194,51 @@ impl Audience {
     }
 }
 
+/// Who can't be heard any more, and whether this process is to be started again for it.
+struct Strangers {
+    /// When this process began.
+    start: Instant,
+    /// Whether this process is started again where it ends for that.
+    started_again: bool,
+    /// Those that were forgotten, the last one first.
+    forgotten: VecDeque<GUID>,
+}
+
+impl Strangers {
+    fn new(start: Instant, started_again: bool) -> Self {
+        Self { start, started_again, forgotten: VecDeque::new() }
+    }
+
+    /// A participant's lease was over.
+    fn forget(&mut self, participant: GUID) {
+        self.forgotten.truncate(MOST_FORGOTTEN - 1);
+        self.forgotten.push_front(participant);
+    }
+
+    /// A participant was met: an error to end with if it was forgotten before.
+    fn meet(&mut self, participant: GUID) -> Option<Estranged> {
+        let before = self.forgotten.len();
+        self.forgotten.retain(|id| *id != participant);
+        let came_back = self.forgotten.len() < before;
+        self.fatal(came_back.then(|| Estranged::CameBack(format!("{:?}", participant.prefix)))?, true)
+    }
+
+    /// Looks for a handshake that takes too long: an error to end with if one began while this process joined.
+    fn look(&self, endpoints: &Endpoints, now: Instant) -> Option<Estranged> {
+        let (participant, since) = endpoints.take_overdue_handshake(now)?;
+        self.fatal(Estranged::NotLetIn(format!("{:?}", participant.prefix)), since < self.start + JOINING)
+    }
+
+    /// Gives the error back if this process is started again and that helps; otherwise it is a warning.
+    fn fatal(&self, error: Estranged, another_start_helps: bool) -> Option<Estranged> {
+        if self.started_again && another_start_helps {
+            return Some(error);
+        }
+        log::warn!("{error}");
+        None
+    }
+}
+
 /// Keeps account of who listens, and warns of those who would but can't. Resolves when this process and another one can't
 /// hear each other and it is for this one to be started again; otherwise that is a warning, too.
 pub(super) async fn follow(
@@ -193,8 +247,7 @@ pub(super) async fn follow(
     started_again: bool,
 ) -> Estranged {
     let Some(participant) = participant else { return std::future::pending().await };
-    let mut forgotten = VecDeque::new();
-    let start = Instant::now();
+    let mut strangers = Strangers::new(Instant::now(), started_again);
     // Of a participant's id the middleware sometimes tells the prefix alone.
     let whole_id = |prefix| GUID { prefix, ..participant.guid() };
     let listener = participant.status_listener();
@@ -204,12 +257,8 @@ pub(super) async fn follow(
         let event = futures::select! {
             event = events.next() => event,
             _ = looks.next() => {
-                if let Some((id, since)) = endpoints.take_overdue_handshake() {
-                    let error = Estranged::NotLetIn(format!("{:?}", id.prefix));
-                    if started_again && since < start + JOINING {
-                        return error;
-                    }
-                    log::warn!("{error}");
+                if let Some(error) = strangers.look(&endpoints, Instant::now()) {
+                    return error;
                 }
                 continue;
             }
@@ -230,19 +279,15 @@ pub(super) async fn follow(
             DomainParticipantStatusEvent::ReaderLost { guid, .. } => endpoints.lost(guid),
             DomainParticipantStatusEvent::ParticipantLost { id, reason } => {
                 endpoints.lost_all(|reader| reader.prefix == id);
-                endpoints.with(|table| table.handshakes.remove(&whole_id(id)));
+                endpoints.handshake_ended(whole_id(id));
                 if matches!(reason, LostReason::Timeout { .. }) {
-                    forgotten.truncate(MOST_FORGOTTEN - 1);
-                    forgotten.push_front(id);
+                    strangers.forget(whole_id(id));
                 }
             }
-            DomainParticipantStatusEvent::ParticipantDiscovered { dpd } if forgotten.contains(&dpd.guid.prefix) => {
-                forgotten.retain(|id| *id != dpd.guid.prefix);
-                let error = Estranged::CameBack(format!("{:?}", dpd.guid.prefix));
-                if started_again {
+            DomainParticipantStatusEvent::ParticipantDiscovered { dpd } => {
+                if let Some(error) = strangers.meet(whole_id(dpd.guid.prefix)) {
                     return error;
                 }
-                log::warn!("{error}");
             }
             DomainParticipantStatusEvent::RemoteReaderQosIncompatible {
                 local_writer: local,
@@ -261,11 +306,11 @@ pub(super) async fn follow(
             #[cfg(feature = "security")]
             DomainParticipantStatusEvent::Authentication { participant, status } => {
                 let other = whole_id(participant);
-                endpoints.with(|table| match format!("{status:?}").as_str() {
+                match format!("{status:?}").as_str() {
                     // The middleware doesn't give out the type of this.
-                    "Authenticating" => table.handshakes.insert(other, Instant::now()),
-                    _ => table.handshakes.remove(&other),
-                });
+                    "Authenticating" => endpoints.handshake_began(other, Instant::now()),
+                    _ => endpoints.handshake_ended(other),
+                }
             }
             _ => {}
         }
@@ -287,5 +332,62 @@ fn warn_of_incompatible(
             offered.reliability(),
             offered.durability()
         );
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const SOON: Duration = Duration::from_millis(1);
+
+    fn participant(k: u8) -> GUID {
+        GUID::from_bytes([k; 16])
+    }
+
+    #[test]
+    fn a_handshake_that_takes_too_long_is_told_of_once() {
+        let (endpoints, start) = (Endpoints::default(), Instant::now());
+        let strangers = Strangers::new(start, true);
+        for k in 1..=3 {
+            endpoints.handshake_began(participant(k), start);
+        }
+        endpoints.handshake_ended(participant(2));
+        // It begins anew.
+        endpoints.handshake_began(participant(3), start + JOINING);
+        assert!(strangers.look(&endpoints, start + HANDSHAKE_PATIENCE).is_none());
+        let late = start + HANDSHAKE_PATIENCE + SOON;
+        assert!(matches!(strangers.look(&endpoints, late), Some(Estranged::NotLetIn(_))));
+        assert!(strangers.look(&endpoints, late).is_none(), "it was told of already");
+        assert_eq!(endpoints.handshakes(), 1);
+    }
+
+    #[test]
+    fn another_start_is_for_those_who_join_and_are_started_again() {
+        let start = Instant::now();
+        let ends = |began: Duration, started_again: bool| {
+            let endpoints = Endpoints::default();
+            endpoints.handshake_began(participant(1), start + began);
+            let late = start + began + HANDSHAKE_PATIENCE + SOON;
+            let ends = Strangers::new(start, started_again).look(&endpoints, late).is_some();
+            assert_eq!(endpoints.handshakes(), 0);
+            ends
+        };
+        assert!(ends(Duration::ZERO, true) && ends(JOINING - SOON, true));
+        assert!(!ends(JOINING, true), "the other one joins, and is to be started again");
+        assert!(!ends(Duration::ZERO, false));
+    }
+
+    #[test]
+    fn one_that_was_forgotten_and_comes_back_is_a_stranger() {
+        let mut strangers = Strangers::new(Instant::now(), true);
+        let [one, other] = [1, 2].map(participant);
+        strangers.forget(one);
+        assert!(strangers.meet(other).is_none());
+        assert!(matches!(strangers.meet(one), Some(Estranged::CameBack(_))));
+        assert!(strangers.meet(one).is_none(), "it was told of already");
+        strangers.forget(one);
+        (0..MOST_FORGOTTEN).for_each(|_| strangers.forget(other));
+        assert!(strangers.meet(one).is_none(), "those that have been away longest are not expected back");
     }
 }
