@@ -10,6 +10,7 @@ pub mod cell;
 pub mod cli;
 mod console;
 pub mod feature;
+mod fields;
 pub mod offline;
 pub mod picture;
 pub mod ros;

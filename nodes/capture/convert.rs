@@ -13,13 +13,8 @@ use jigsaw_msgs::std_msgs::msg::Header;
 
 use super::known::FrameName;
 use super::source::Frame;
+use crate::fields::{MAX_AREA_PX, MAX_SIDE_PX, header_fault};
 use crate::ros::health::shown;
-
-/// Largest side of a frame. Real cameras end at about 20 000; a claim beyond that is nonsense that would cost memory.
-pub const MAX_SIDE_PX: u32 = 32_768;
-
-/// Largest area of a frame: 150 megapixels.
-pub const MAX_AREA_PX: u64 = 150_000_000;
 
 /// Most memory that decoding one file may take, in bytes.
 const MAX_DECODER_MEMORY: u64 = 1 << 30;
@@ -122,32 +117,6 @@ impl FrameError {
             Self::NoPiece { .. } => "no_piece",
         }
     }
-}
-
-/// Longest name of a frame or a source, in bytes; far more than anyone writes, and little enough to be kept.
-pub const MAX_NAME_LENGTH: usize = 1024;
-
-/// A field that breaks a rule: field, value, rule.
-pub type Fault = (&'static str, String, &'static str);
-
-/// Whether a text can be taken over into messages and logs.
-pub fn text_fault(field: &'static str, text: &str) -> Option<Fault> {
-    let fits = text.len() <= MAX_NAME_LENGTH && !text.chars().any(char::is_control);
-    (!fits).then(|| (field, format!("'{}'", shown(text)), "at most 1024 bytes without control characters"))
-}
-
-/// What is wrong with a header, if anything. Its time may lie years back (as a bag's does) or before that of the message
-/// before it.
-pub fn header_fault(header: &Header) -> Option<Fault> {
-    const NANOS: u32 = 1_000_000_000;
-    let Time { sec, nanosec } = header.stamp;
-    if sec < 0 {
-        return Some(("header.stamp.sec", sec.to_string(), "0 or more"));
-    }
-    if nanosec >= NANOS {
-        return Some(("header.stamp.nanosec", nanosec.to_string(), "less than 1000000000"));
-    }
-    text_fault("header.frame_id", &header.frame_id)
 }
 
 fn check_header(source_name: &str, header: &Header) -> Result<(), FrameError> {

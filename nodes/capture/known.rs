@@ -10,6 +10,8 @@ use std::ops::Range;
 
 use isthmus::mask::{Aoi, Cutout};
 
+use crate::fields::camera;
+
 /// What identifies a frame.
 #[derive(Debug, Clone, PartialEq, Eq, Hash)]
 pub enum FrameName {
@@ -42,12 +44,6 @@ impl FrameName {
             Self::Stamp(..) => self.base(),
         }
     }
-}
-
-/// The camera that a topic is of: image transports send its frames once more, compressed, on a topic named after the raw
-/// one.
-pub fn camera(topic: &str) -> &str {
-    topic.strip_suffix("/compressed").unwrap_or(topic)
 }
 
 /// The names of the pieces of a frame: its own of a single one, with a number of several.

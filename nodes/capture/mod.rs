@@ -20,7 +20,7 @@ use jigsaw_msgs::msg::PieceImage;
 use jigsaw_msgs::std_msgs::msg::Empty;
 use jigsaw_msgs::std_srvs::srv::{Trigger, TriggerResponse};
 
-use crate::ros::activity::WhileInactive;
+use crate::ros::activity::{WhileInactive, inactive};
 use crate::ros::exit::ProcessError;
 use crate::ros::health::Health;
 use crate::ros::lifecycle::Forget;
@@ -146,7 +146,7 @@ pub async fn run(
     settings: Settings,
 ) {
     let Settings { parameters, health, activity } = settings;
-    let threads = params::threads(&parameters, &params::THREADS);
+    let threads = parameters.threads(&params::THREADS);
     // Files that a call wants read again come in beside the frames.
     let (again, more) = mpsc::unbounded();
     let mut again = Some(again);
@@ -190,11 +190,6 @@ pub async fn run(
             complete => break,
         }
     }
-}
-
-/// The answer to a call that comes while the node does not work.
-pub(crate) fn inactive() -> TriggerResponse {
-    TriggerResponse { success: false, message: "the node is not active".to_owned() }
 }
 
 /// Names the pieces of a frame, publishes the new ones, and gives all of them for the `capture` service.

@@ -53,11 +53,3 @@ pub const PARAMETERS: &[Spec] = &[SOURCE, METRES_PER_PIXEL, SAME_PLACE_OVERLAP, 
 pub fn source_folder(parameters: &Parameters) -> Option<PathBuf> {
     Some(parameters.text(&SOURCE)).filter(|text| !text.is_empty()).map(PathBuf::from)
 }
-
-/// How many frames (or pieces) to work on at a time.
-pub(crate) fn threads(parameters: &Parameters, spec: &Spec) -> usize {
-    match usize::try_from(parameters.integer(spec)) {
-        Ok(0) | Err(_) => std::thread::available_parallelism().map_or(1, usize::from),
-        Ok(threads) => threads,
-    }
-}

@@ -1,16 +1,15 @@
 //! Messages of pieces to cutouts, features to messages.
 
-use image::RgbImage;
 use isthmus::isthmus::{Isthmus, Polarity};
 use isthmus::mask::{Aoi, Cutout};
 use isthmus::skeleton::Skeleton;
 use isthmus::{Features, Point, profile};
 use jigsaw_msgs::geometry_msgs::msg::Point32;
 use jigsaw_msgs::msg::{Isthmus as IsthmusMessage, PieceFeatures, PieceImage, SkeletonBranch};
-use jigsaw_msgs::sensor_msgs::msg::Image;
-use jigsaw_msgs::std_msgs::msg::Header;
 
-use crate::capture::convert::{MAX_AREA_PX, MAX_SIDE_PX, header_fault, text_fault};
+use crate::fields::{
+    MAX_AREA_PX, MAX_ID_LENGTH, MAX_SIDE_PX, SCALE_RULE, SCALES, header_fault, is_piece_id, text_fault,
+};
 use crate::ros::health::shown;
 
 /// Samples of an isthmus distance function in the message: what the paper's plots show, and what 4-byte floats of a
@@ -55,21 +54,6 @@ impl PieceImageError {
             Self::Shape { .. } => "shape",
         }
     }
-}
-
-/// Longest name of a piece, in bytes; coordinate frames carry it.
-pub const MAX_ID_LENGTH: usize = 200;
-
-/// Scales that make sense, in metres a pixel: from an electron microscope to a picture of the Earth. Others would become
-/// zero or infinite as the messages' single precision numbers.
-pub const SCALES: std::ops::RangeInclusive<f64> = 1e-9..=1e3;
-
-/// [`SCALES`] in words.
-pub const SCALE_RULE: &str = "1e-9 to 1000";
-
-/// Whether a piece may be called so: its name is a part of the name of a coordinate frame.
-pub fn is_piece_id(id: &str) -> bool {
-    (1..=MAX_ID_LENGTH).contains(&id.len()) && !id.chars().any(|c| c == '/' || c.is_whitespace() || c.is_control())
 }
 
 /// The cutout that a message carries.
@@ -137,19 +121,6 @@ pub fn cutout(message: &mut PieceImage) -> Result<Cutout, PieceImageError> {
         ground_level: message.ground_level,
         noise_level: message.noise_level,
     })
-}
-
-/// A picture as a message, `rgb8`.
-pub fn image_message(header: Header, picture: RgbImage) -> Image {
-    Image {
-        header,
-        height: picture.height(),
-        width: picture.width(),
-        encoding: "rgb8".to_owned(),
-        is_bigendian: 0,
-        step: 3 * picture.width(),
-        data: picture.into_raw(),
-    }
 }
 
 /// The message of a piece's features; header, name and place are those of the piece's picture.

@@ -10,7 +10,7 @@ use isthmus::Extractor;
 use jigsaw_msgs::msg::{PieceFeatures, PieceImage};
 use jigsaw_msgs::sensor_msgs::msg::Image;
 
-use crate::capture::params::threads;
+use crate::fields::image_message;
 use crate::picture::{InspectionStyle, inspection};
 use crate::ros::activity::WhileInactive;
 use crate::ros::discovery::Audience;
@@ -103,7 +103,7 @@ pub async fn run(
     settings: Settings,
 ) {
     let Settings { parameters, health, activity } = settings;
-    let threads = threads(&parameters, &params::THREADS);
+    let threads = parameters.threads(&params::THREADS);
     let wanted = overlays.wanted;
     let mut extracted = pieces
         .map(|piece| {
@@ -140,7 +140,7 @@ fn extract(mut piece: PieceImage, draw: bool) -> Result<(PieceFeatures, Option<I
         .map_err(|e| PieceImageError::Shape { id: piece.id.clone(), reason: e.to_string() })?;
     let overlay = draw.then(|| {
         let picture = inspection(&piece.id, &piece.source, &cutout, &features, OVERLAY_STYLE);
-        convert::image_message(piece.header.clone(), picture)
+        image_message(piece.header.clone(), picture)
     });
     Ok((convert::features_message(&piece, &features), overlay))
 }

@@ -5,6 +5,7 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 use futures::channel::{mpsc, oneshot};
 use futures::{Stream, StreamExt, stream};
+use jigsaw_msgs::std_srvs::srv::TriggerResponse;
 
 /// Whether a node works now: what its loop asks, and waits for.
 #[derive(Debug, Clone, Default)]
@@ -24,6 +25,11 @@ pub enum WhileInactive {
     Drop,
     /// It waits, in the middleware's cache: a piece is sent once.
     Hold,
+}
+
+/// The answer to a call that comes while the node does not work.
+pub(crate) fn inactive() -> TriggerResponse {
+    TriggerResponse { success: false, message: "the node is not active".to_owned() }
 }
 
 impl Activity {

@@ -329,6 +329,14 @@ impl Parameters {
         }
     }
 
+    /// How many pieces of work to do at a time: the value of an `int64`, for 0 as many as there are processors.
+    pub fn threads(&self, spec: &Spec) -> usize {
+        match usize::try_from(self.integer(spec)) {
+            Ok(0) | Err(_) => std::thread::available_parallelism().map_or(1, usize::from),
+            Ok(threads) => threads,
+        }
+    }
+
     fn find(&self, name: &str) -> Result<usize, ParameterError> {
         self.specs.iter().position(|spec| spec.name == name).ok_or_else(|| ParameterError::Unknown {
             name: name.to_owned(),

@@ -21,9 +21,9 @@ use jigsaw_msgs::tf2_msgs::msg::TFMessage;
 use jigsaw_msgs::visualization_msgs::msg::{Marker, MarkerArray};
 use nalgebra::{Isometry2, Point2};
 
-use crate::capture::convert::{MAX_SIDE_PX, header_fault, text_fault};
-use crate::capture::known::camera;
-use crate::feature::convert::{MAX_ID_LENGTH, SCALE_RULE, SCALES, image_message, is_piece_id};
+use crate::fields::{
+    MAX_ID_LENGTH, MAX_SIDE_PX, SCALE_RULE, SCALES, camera, header_fault, image_message, is_piece_id, text_fault,
+};
 use crate::picture::{self, AssemblyStyle};
 use crate::ros::health::shown;
 use crate::ros::transforms::{PixelPlane, pose_message};

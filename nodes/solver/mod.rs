@@ -26,9 +26,8 @@ use jigsaw_msgs::std_srvs::srv::{Trigger, TriggerResponse};
 use jigsaw_msgs::tf2_msgs::msg::TFMessage;
 use jigsaw_msgs::visualization_msgs::msg::MarkerArray;
 
-use crate::capture::inactive;
 use crate::ros::actions::{Goal, GoalEnd};
-use crate::ros::activity::{Activity, WhileInactive};
+use crate::ros::activity::{Activity, WhileInactive, inactive};
 use crate::ros::exit::ProcessError;
 use crate::ros::health::Health;
 use crate::ros::lifecycle::Forget;
