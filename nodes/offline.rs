@@ -27,7 +27,8 @@ use serde::Serialize;
 
 use crate::bag::frames::{FrameBag, TOPIC};
 use crate::bag::{BagError, BagReader, RawMessage, Selection, Storage, TopicCount, cdr};
-use crate::capture::convert::{self, Picture, Pixels};
+use crate::capture::convert::{self, FrameError, Picture};
+use crate::capture::cut::{self, Pixels};
 use crate::capture::known::{FrameName, Known};
 use crate::capture::params::SAME_PLACE_OVERLAP;
 use crate::capture::source::{Frame, PICTURE_ENDINGS};
@@ -585,11 +586,8 @@ struct Segmented {
 fn segment(segmenter: &mut Segmenter, picture: Picture) -> Result<Segmented, String> {
     let source = picture.name.source().to_owned();
     let frame = Pixels::from(picture.pixels);
-    let view = frame.frame().map_err(|error| format!("{source}: {error}"))?;
-    let segmentation = segmenter.segment(&view, &mask::Parameters::default());
-    if segmentation.cutouts.is_empty() {
-        return Err(format!("{source}: no piece in the picture: {}", convert::why_empty(&segmentation)));
-    }
+    let no_piece = |reason| FrameError::NoPiece { source_name: source, reason }.to_string();
+    let segmentation = frame.cut(segmenter).map_err(no_piece)?;
     Ok(Segmented { name: picture.name, content: picture.content, frame, segmentation })
 }
 
@@ -599,7 +597,7 @@ fn analyse(extractor: &mut Extractor, segmented: Segmented) -> Looked {
     let source = name.source();
     let mut shapes = vec![];
     let mut warnings: Vec<String> =
-        convert::left_out(&segmentation).iter().map(|what| format!("{source}: {what}")).collect();
+        cut::left_out(&segmentation).iter().map(|what| format!("{source}: {what}")).collect();
     let is_piece = |r: &&mask::Rejected| matches!(r.reason, mask::Reason::CutByFrame | mask::Reason::Touching);
     let mut unusable = segmentation.rejected.iter().filter(is_piece).count();
     for cutout in segmentation.cutouts {

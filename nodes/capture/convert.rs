@@ -1,16 +1,17 @@
-//! Frames to grey pictures, cutouts to messages.
+//! Frames to pictures, cutouts to messages.
 
 use std::hash::{DefaultHasher, Hash, Hasher};
 use std::path::Path;
 use std::time::UNIX_EPOCH;
 
 use image::{DynamicImage, GrayImage, ImageReader, Limits, RgbImage, RgbaImage};
-use isthmus::mask::{self, Aoi, Cutout};
+use isthmus::mask::{Aoi, Cutout};
 use jigsaw_msgs::builtin_interfaces::msg::Time;
 use jigsaw_msgs::msg::PieceImage;
 use jigsaw_msgs::sensor_msgs::msg::{CompressedImage, Image};
 use jigsaw_msgs::std_msgs::msg::Header;
 
+use super::cut::stretched;
 use super::known::FrameName;
 use super::source::Frame;
 use crate::fields::{MAX_AREA_PX, MAX_SIDE_PX, header_fault};
@@ -236,13 +237,6 @@ fn levels(data: &[u8], big_endian: bool) -> Vec<u16> {
     data.as_chunks::<2>().0.iter().map(level).collect()
 }
 
-/// 16-bit levels as 8-bit ones over the range they use: cameras of 10 to 14 bits fill but a part of the 16.
-fn stretched(levels: &[u16]) -> Vec<u8> {
-    let (low, high) = levels.iter().fold((u16::MAX, 0), |(low, high), &v| (low.min(v), high.max(v)));
-    let range = u32::from(high.saturating_sub(low)).max(1);
-    levels.iter().map(|&v| (u32::from(v - low) * 255 / range) as u8).collect()
-}
-
 fn decode(topic: &str, image: &CompressedImage) -> Result<DynamicImage, FrameError> {
     let reader = ImageReader::new(std::io::Cursor::new(&image.data)).with_guessed_format();
     decoded(topic, reader.map_err(|e| undecodable(topic, e))?)
@@ -279,108 +273,6 @@ fn decoded<R: std::io::BufRead + std::io::Seek>(
 
 fn undecodable(source_name: &str, reason: impl std::fmt::Display) -> FrameError {
     FrameError::Undecodable { source_name: source_name.to_owned(), reason: reason.to_string() }
-}
-
-/// The pixels of a picture in a form the segmentation takes: grey, or red, green and blue.
-#[derive(Debug)]
-pub enum Pixels {
-    /// One byte a pixel.
-    Grey(GrayImage),
-    /// Three bytes a pixel.
-    Rgb(RgbImage),
-}
-
-impl From<DynamicImage> for Pixels {
-    /// What is transparent is ground, whatever colour it has: of a picture that is transparent in parts only the transparency counts.
-    fn from(image: DynamicImage) -> Self {
-        let [width, height] = [image.width(), image.height()];
-        if let Some(opacity) = opacity(&image) {
-            return Self::Grey(opacity);
-        }
-        match image {
-            DynamicImage::ImageLuma8(grey) => Self::Grey(grey),
-            DynamicImage::ImageLumaA8(_) => Self::Grey(image.into_luma8()),
-            DynamicImage::ImageLuma16(_) | DynamicImage::ImageLumaA16(_) => {
-                let mut grey = GrayImage::new(width, height);
-                grey.copy_from_slice(&stretched(&image.into_luma16()));
-                Self::Grey(grey)
-            }
-            DynamicImage::ImageRgb16(_) | DynamicImage::ImageRgba16(_) => {
-                let mut colour = RgbImage::new(width, height);
-                colour.copy_from_slice(&stretched(&image.into_rgb16()));
-                Self::Rgb(colour)
-            }
-            colour => Self::Rgb(colour.into_rgb8()),
-        }
-    }
-}
-
-/// Least part of a picture that is transparent where that means ground: the rounded corners of a window take less.
-const MIN_TRANSPARENT: f64 = 0.02;
-/// Alpha from which on a pixel counts as opaque: half.
-const OPAQUE: u8 = 128;
-
-/// The alpha channel of a picture that has opaque and transparent parts.
-fn opacity(image: &DynamicImage) -> Option<GrayImage> {
-    let alpha: Vec<u8> = match image {
-        DynamicImage::ImageLumaA8(picture) => picture.pixels().map(|p| p.0[1]).collect(),
-        DynamicImage::ImageRgba8(picture) => picture.pixels().map(|p| p.0[3]).collect(),
-        _ if image.color().has_alpha() => image.to_rgba8().pixels().map(|p| p.0[3]).collect(),
-        _ => return None,
-    };
-    let transparent = alpha.iter().filter(|a| **a < OPAQUE).count();
-    let is_cut_out = transparent < alpha.len() && transparent as f64 >= MIN_TRANSPARENT * alpha.len() as f64;
-    is_cut_out.then(|| GrayImage::from_raw(image.width(), image.height(), alpha)).flatten()
-}
-
-impl Pixels {
-    /// The frame to cut out of.
-    ///
-    /// # Errors
-    /// A size the segmentation can't address.
-    pub fn frame(&self) -> Result<mask::Frame<'_>, mask::MaskError> {
-        match self {
-            Self::Grey(image) => mask::Frame::grey(image.width(), image.height(), image.as_raw()),
-            Self::Rgb(image) => mask::Frame::rgb(image.width(), image.height(), image.as_raw()),
-        }
-    }
-}
-
-/// Why a segmentation has no cutout, in words.
-pub fn why_empty(segmentation: &mask::Segmentation) -> String {
-    match segmentation.rejected.first() {
-        None => "nothing stands out from the ground".to_owned(),
-        Some(first) => format!(
-            "{} thing(s) stand out from the ground, but none is taken for a piece; the first, at ({}, {}): {:?}",
-            segmentation.rejected.len(),
-            first.aoi.x,
-            first.aoi.y,
-            first.reason
-        ),
-    }
-}
-
-/// What is wrong with a segmentation, in words: pieces left out, pieces that had to be cut apart, and pieces beside shadows.
-pub fn left_out(segmentation: &mask::Segmentation) -> Vec<String> {
-    let shape = |aoi: &Aoi| format!("the shape of {} x {} px at ({}, {})", aoi.width, aoi.height, aoi.x, aoi.y);
-    let rejected = segmentation.rejected.iter().filter_map(|rejected| {
-        // Specks, hairs and glare are no pieces: nothing is lost without them.
-        let why = match rejected.reason {
-            mask::Reason::CutByFrame => "is cut by the edge of the frame",
-            mask::Reason::Touching => "is two pieces that touch",
-            mask::Reason::Convex => "has neither tab nor blank, as the others have",
-            _ => return None,
-        };
-        Some(format!("{} {why}; left out", shape(&rejected.aoi)))
-    });
-    let separated = segmentation.separated.iter().map(|aoi| {
-        format!("{} is pieces that touch; cut apart, their borders are straight where they touched", shape(aoi))
-    });
-    let shaded = segmentation.shaded.len();
-    let shaded = (shaded > 0).then(|| {
-        format!("{shaded} shape(s) cast a shadow; where it lies beside them their borders are told less exactly")
-    });
-    rejected.chain(separated).chain(shaded).collect()
 }
 
 /// The message of one piece.
@@ -472,50 +364,6 @@ mod tests {
             let big = Image { is_bigendian: 1, ..image(encoding, 2, &big) };
             assert_eq!(read(image(encoding, 2, &little)).unwrap().to_luma8().as_raw(), &expected, "{encoding}");
             assert_eq!(read(big).unwrap().to_luma8().as_raw(), &expected, "{encoding}");
-        }
-    }
-
-    #[test]
-    fn sixteen_bits_of_a_file_are_stretched_as_those_of_a_camera() {
-        let grey = image::ImageBuffer::from_raw(2, 2, vec![0_u16, 1000, 2000, 4000]).map(DynamicImage::ImageLuma16);
-        let Pixels::Grey(grey) = Pixels::from(grey.unwrap()) else { panic!("grey") };
-        assert_eq!(grey.as_raw(), &[0, 63, 127, 255]);
-        let colour = image::ImageBuffer::from_raw(2, 1, vec![0_u16, 1000, 2000, 4000, 0, 1000]);
-        let Pixels::Rgb(colour) = Pixels::from(colour.map(DynamicImage::ImageRgb16).unwrap()) else { panic!("rgb") };
-        assert_eq!(colour.as_raw(), &[0, 63, 127, 255, 0, 63]);
-    }
-
-    #[test]
-    fn transparency_is_ground_whatever_colour_it_hides() {
-        /// A square of this opacity on a transparent ground, all of one colour.
-        fn square(alpha: u8) -> DynamicImage {
-            let is_within = |v: u32| (8..24).contains(&v);
-            DynamicImage::ImageRgba8(RgbaImage::from_fn(32, 32, |x, y| {
-                image::Rgba([90, 60, 30, if is_within(x) && is_within(y) { alpha } else { 0 }])
-            }))
-        }
-        let shapes = |picture: DynamicImage| {
-            let pixels = Pixels::from(picture);
-            let segmentation = mask::segment(&pixels.frame().unwrap(), &mask::Parameters::default());
-            segmentation.cutouts.iter().map(|c| (c.aoi.x, c.aoi.y, c.aoi.width, c.aoi.height)).collect::<Vec<_>>()
-        };
-        let expected = [(8, 8, 16, 16)];
-        assert_eq!(shapes(square(255)), expected);
-        let sixteen_bits = DynamicImage::ImageRgba16(square(255).into_rgba16());
-        assert_eq!(shapes(sixteen_bits), expected);
-        assert_eq!(shapes(DynamicImage::ImageLumaA8(square(255).into_luma_alpha8())), expected);
-    }
-
-    #[test]
-    fn transparency_that_tells_no_parts_apart_is_passed_over() {
-        let picture = |alpha: fn(u32) -> u8| {
-            let pixel = |x: u32, y: u32| image::Rgba([x as u8, 2, 3, alpha(x + 100 * y)]);
-            Pixels::from(DynamicImage::ImageRgba8(RgbaImage::from_fn(100, 100, pixel)))
-        };
-        let alphas: [fn(u32) -> u8; 3] = [|_| 255, |_| 0, |at| if at < 100 { 0 } else { 255 }];
-        for alpha in alphas {
-            let Pixels::Rgb(colour) = picture(alpha) else { panic!("rgb") };
-            assert_eq!(colour.get_pixel(7, 50).0, [7, 2, 3]);
         }
     }
 

@@ -5,6 +5,7 @@
 //! (throttled) line and counted, and the next one is taken.
 
 pub mod convert;
+pub mod cut;
 pub mod known;
 pub mod params;
 pub mod source;
@@ -15,7 +16,7 @@ use std::sync::Arc;
 use futures::channel::mpsc;
 use futures::stream::{self, LocalBoxStream};
 use futures::{Sink, SinkExt, Stream, StreamExt};
-use isthmus::mask::{self, Cutout};
+use isthmus::mask::{Cutout, Segmenter};
 use jigsaw_msgs::msg::PieceImage;
 use jigsaw_msgs::std_msgs::msg::Empty;
 use jigsaw_msgs::std_srvs::srv::{Trigger, TriggerResponse};
@@ -29,6 +30,7 @@ use crate::ros::process::{Program, Work};
 use crate::ros::session::{Call, Session, Settings};
 use crate::ros::topics;
 use convert::{FrameError, FrameHead};
+use cut::Pixels;
 use known::{FrameName, Known};
 use source::Frame;
 
@@ -255,16 +257,11 @@ fn cut_out(frame: Frame) -> Result<Seen, FrameError> {
     let picture = convert::picture(frame)?;
     let source = picture.name.source().to_owned();
     let (width, height) = (picture.pixels.width(), picture.pixels.height());
-    let no_piece = |reason: String| FrameError::NoPiece { source_name: source.clone(), reason };
-    let pixels = convert::Pixels::from(picture.pixels);
-    let frame = pixels.frame().map_err(|e| no_piece(e.to_string()))?;
-    let segmentation = mask::segment(&frame, &mask::Parameters::default());
-    if segmentation.cutouts.is_empty() {
-        return Err(no_piece(convert::why_empty(&segmentation)));
-    }
-    let left_out = convert::left_out(&segmentation);
+    let segmentation = Pixels::from(picture.pixels)
+        .cut(&mut Segmenter::default())
+        .map_err(|reason| FrameError::NoPiece { source_name: source.clone(), reason })?;
     Ok(Seen {
-        left_out,
+        left_out: cut::left_out(&segmentation),
         name: picture.name,
         content: picture.content,
         head: FrameHead { header: picture.header, source, width, height },
