@@ -13,6 +13,7 @@ pub mod feature;
 mod fields;
 pub mod offline;
 pub mod picture;
+mod results;
 pub mod ros;
 pub mod solver;
 pub mod watch;

@@ -14,13 +14,17 @@ use std::time::Duration;
 
 use clap::Args;
 use futures::{FutureExt, StreamExt};
+use jigsaw::TableCounts;
 use jigsaw_msgs::geometry_msgs::msg::Pose;
 use jigsaw_msgs::msg::{Assembly as AssemblyMessage, PieceFeatures};
 use jigsaw_msgs::sensor_msgs::msg::Image;
 use nalgebra::{Isometry2, Point2, Vector2};
-use serde_json::{Value, json};
 
 use crate::console::{complain, say};
+use crate::results::{
+    AoiRecord, AssemblyFile, MatingRecord, PlacedRecord, PoseRecord, Seconds, SideRecord, WriteError, make_folder,
+    write_file, write_json,
+};
 use crate::ros::exit::exit_code;
 use crate::ros::process::Process;
 use crate::ros::session::{Session, SessionError};
@@ -139,7 +143,7 @@ pub fn run(args: WatchArgs) -> ExitCode {
     };
     say!("{}", table(assembly, pieces).trim_end());
     if let Err(error) = write(&args.out, assembly, &heard) {
-        complain!("jigsaw watch: {}: {error}", args.out.display());
+        complain!("jigsaw watch: {error}");
         return ExitCode::from(BAD_INPUT);
     }
     if heard.shapeless() > 0 {
@@ -232,21 +236,13 @@ fn table(assembly: &AssemblyMessage, pieces: Option<usize>) -> String {
 }
 
 /// Writes what was heard.
-fn write(out: &Path, assembly: &AssemblyMessage, heard: &Heard) -> std::io::Result<()> {
-    std::fs::create_dir_all(out)?;
-    let text = format!("{:#}\n", in_pixels(assembly, &heard.features));
-    write_beside(&out.join("assembly.json"), text.as_bytes())?;
+fn write(out: &Path, assembly: &AssemblyMessage, heard: &Heard) -> Result<(), WriteError> {
+    make_folder(out)?;
+    write_json(&out.join("assembly.json"), &in_pixels(assembly, &heard.features))?;
     if let Some(png) = heard.picture.as_ref().and_then(png) {
-        write_beside(&out.join("assembly.png"), &png)?;
+        write_file(&out.join("assembly.png"), |file| file.write_all(&png))?;
     }
     Ok(())
-}
-
-/// Writes a file beside its place and renames it, so that nobody reads half of it.
-fn write_beside(path: &Path, bytes: &[u8]) -> std::io::Result<()> {
-    let beside = path.with_extension("part");
-    std::fs::write(&beside, bytes)?;
-    std::fs::rename(&beside, path)
 }
 
 /// The picture as PNG; `None` where it is not a whole colour or grey picture.
@@ -276,7 +272,7 @@ fn png(picture: &Image) -> Option<Vec<u8>> {
 }
 
 /// The content of `assembly.json`. Times are not known here, so they are zero.
-fn in_pixels(message: &AssemblyMessage, features: &HashMap<String, PieceFeatures>) -> Value {
+fn in_pixels<'a>(message: &'a AssemblyMessage, features: &'a HashMap<String, PieceFeatures>) -> AssemblyFile<'a> {
     let mut placed = Vec::new();
     let mut scale = 1.0;
     let mut corner = Point2::new(f64::INFINITY, f64::INFINITY);
@@ -297,39 +293,40 @@ fn in_pixels(message: &AssemblyMessage, features: &HashMap<String, PieceFeatures
         placed.push((pose, seen, puzzle_from_image));
     }
     placed.sort_by(|(a, ..), (b, ..)| (a.component, &a.id).cmp(&(b.component, &b.id)));
-    let pieces: Vec<Value> = placed
-        .iter()
-        .map(|(pose, seen, puzzle_from_image)| {
-            let place = puzzle_from_image.translation.vector - corner.coords;
-            json!({
-                "id": pose.id, "source": pose.source,
-                "aoi": {"x": seen.aoi_x_px, "y": seen.aoi_y_px, "width": seen.aoi_width_px, "height": seen.aoi_height_px},
-                "puzzle_from_image": {"x": place.x, "y": place.y, "theta": puzzle_from_image.rotation.angle()},
-                "component": pose.component, "confidence": pose.confidence,
-            })
-        })
-        .collect();
-    let matings: Vec<Value> = message
-        .matings
-        .iter()
-        .map(|m| {
-            json!({
-                "positive": {"piece": m.positive_piece, "isthmus": m.positive_isthmus},
-                "negative": {"piece": m.negative_piece, "isthmus": m.negative_isthmus},
-                "correlation": m.correlation, "ave_gap_px": f64::from(m.ave_gap) / scale,
-                "clearance_px": f64::from(m.clearance) / scale, "confidence": m.confidence,
-            })
-        })
-        .collect();
+    let pieces = placed.into_iter().map(|(pose, seen, puzzle_from_image)| {
+        let place = puzzle_from_image.translation.vector - corner.coords;
+        PlacedRecord {
+            id: &pose.id,
+            source: &pose.source,
+            aoi: AoiRecord { x: seen.aoi_x_px, y: seen.aoi_y_px, width: seen.aoi_width_px, height: seen.aoi_height_px },
+            puzzle_from_image: PoseRecord { x: place.x, y: place.y, theta: puzzle_from_image.rotation.angle() },
+            component: pose.component as usize,
+            confidence: pose.confidence.into(),
+        }
+    });
+    let matings = message.matings.iter().map(|m| MatingRecord {
+        positive: SideRecord { piece: &m.positive_piece, isthmus: m.positive_isthmus as usize },
+        negative: SideRecord { piece: &m.negative_piece, isthmus: m.negative_isthmus as usize },
+        correlation: m.correlation.into(),
+        ave_gap_px: f64::from(m.ave_gap) / scale,
+        clearance_px: f64::from(m.clearance) / scale,
+        confidence: m.confidence.into(),
+    });
     let counts = &message.table;
-    json!({
-        "pieces": pieces, "matings": matings, "unplaced": message.unplaced,
-        "table": {
-            "positive": counts.positive, "negative": counts.negative, "pairs": counts.pairs,
-            "after_opening": counts.after_opening, "after_length": counts.after_length,
-            "after_correlation": counts.after_correlation, "after_overlap": counts.after_overlap,
-            "backtracks": counts.backtracks,
+    AssemblyFile {
+        pieces: pieces.collect(),
+        matings: matings.collect(),
+        unplaced: message.unplaced.iter().map(String::as_str).collect(),
+        table: TableCounts {
+            positive: counts.positive as usize,
+            negative: counts.negative as usize,
+            pairs: counts.pairs as usize,
+            after_opening: counts.after_opening as usize,
+            after_length: counts.after_length as usize,
+            after_correlation: counts.after_correlation as usize,
+            after_overlap: counts.after_overlap as usize,
+            backtracks: counts.backtracks as usize,
         },
-        "seconds": {"segment": 0.0, "features": 0.0, "match": 0.0, "assemble": 0.0},
-    })
+        seconds: Seconds::default(),
+    }
 }
