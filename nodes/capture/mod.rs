@@ -27,7 +27,7 @@ use crate::ros::health::Health;
 use crate::ros::lifecycle::Forget;
 use crate::ros::params::Parameters;
 use crate::ros::process::{Program, Work};
-use crate::ros::session::{Call, Session, Settings};
+use crate::ros::session::{Call, Session, SessionError, Settings};
 use crate::ros::topics;
 use convert::{FrameError, FrameHead};
 use cut::Pixels;
@@ -81,8 +81,8 @@ pub fn open(
     let frames: LocalBoxStream<'static, Frame> = match folder.clone() {
         Some(folder) => session.activity.gate(folder_frames(folder, &settings), WhileInactive::Hold),
         None => {
-            let (raw_name, compressed_name) =
-                (session.names().topic(topics::IMAGE.name)?, session.names().topic(topics::IMAGE_COMPRESSED.name)?);
+            let name = |topic| session.names().topic(topic).map_err(SessionError::from);
+            let (raw_name, compressed_name) = (name(topics::IMAGE.name)?, name(topics::IMAGE_COMPRESSED.name)?);
             let raw = session.subscribe(&topics::IMAGE)?;
             let compressed = session.subscribe_to_all(&topics::IMAGE_COMPRESSED)?;
             let frames = stream::select(

@@ -1,8 +1,7 @@
 //! ROS 2 command line: `--ros-args`, remapping, parameters and names.
 //!
 //! The grammar is that of rcl: ROS arguments stand between `--ros-args` and `--` (or the end), any number of times;
-//! everything else is left to the program. Names are resolved here, because the client library knows neither
-//! remapping nor private (`~/`) names.
+//! everything else is left to the program.
 //!
 //! | argument | meaning |
 //! | --- | --- |
@@ -15,11 +14,12 @@
 //!
 //! Where a parameter is given more than once, the last one on the command line wins.
 
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
 use log::LevelFilter;
-use ros2_client::ParameterValue;
-use serde_yaml_ng::Value;
+
+use super::assignments::{Assignment, Override, parse_file};
+use super::names::{NameError, NodeNames, Remap};
 
 /// Why a command line was not understood. Every message names the argument and the rule it breaks.
 #[derive(Debug, thiserror::Error)]
@@ -64,13 +64,8 @@ pub enum ArgsError {
     #[error("log level '{0}' is none of debug, info, warn, error, fatal")]
     LogLevel(String),
     /// A name that breaks the rules of ROS names.
-    #[error("name '{name}': {rule}")]
-    Name {
-        /// The name.
-        name: String,
-        /// The rule it breaks.
-        rule: &'static str,
-    },
+    #[error(transparent)]
+    Name(#[from] NameError),
     /// A variable of the environment with a value out of range.
     #[error("{variable}='{value}': {rule}")]
     Environment {
@@ -81,34 +76,6 @@ pub enum ArgsError {
         /// The rule it breaks.
         rule: &'static str,
     },
-}
-
-/// A value given to a parameter, before any node has looked at it.
-#[derive(Debug, Clone, PartialEq)]
-pub struct Override {
-    /// Parameter name.
-    pub name: String,
-    /// Its value.
-    pub value: ParameterValue,
-    /// Whether it was meant for this node alone (`-p`, or a file key that names the node) rather than for every node
-    /// of a launch (`/**` in a file): only then is a name the node doesn't know a mistake.
-    pub addressed: bool,
-}
-
-#[derive(Debug, Clone)]
-struct Assignment {
-    /// Pattern for the full node name (with `*`, `**`), or a plain node name for `-p node:name:=value`.
-    node: String,
-    addressed: bool,
-    name: String,
-    value: ParameterValue,
-}
-
-#[derive(Debug, Clone)]
-struct Remap {
-    node: Option<String>,
-    from: String,
-    to: String,
 }
 
 /// Everything ROS in a command line.
@@ -184,11 +151,22 @@ impl RosArgs {
                 .ok_or_else(|| ArgsError::MissingValue { option: option.to_owned(), wanted })
         };
         match option {
-            "-r" | "--remap" => self.remaps.push(parse_remap(&value("[node:]from:=to")?)?),
-            "-p" | "--param" => self.assignments.push(parse_assignment(&value("[node:]name:=value")?)?),
+            "-r" | "--remap" => {
+                let rule = value("[node:]from:=to")?;
+                let remap = split_rule(&rule).and_then(|(node, from, to)| Remap::new(node, from, to));
+                self.remaps.push(remap.map_err(|reason| ArgsError::Remap { rule, reason })?);
+            }
+            "-p" | "--param" => {
+                let rule = value("[node:]name:=value")?;
+                let given = split_rule(&rule).and_then(|(node, name, value)| Assignment::new(node, name, value));
+                self.assignments.push(given.map_err(|reason| ArgsError::Parameter { rule, reason })?);
+            }
             "--params-file" => {
                 let file = value("a YAML file")?;
-                self.assignments.extend(read_parameters_file(Path::new(&file))?);
+                let text = std::fs::read_to_string(&file).map_err(|e| e.to_string());
+                let given = text.and_then(|text| parse_file(&text));
+                self.assignments
+                    .extend(given.map_err(|reason| ArgsError::ParametersFile { file: file.into(), reason })?);
             }
             "--log-level" => {
                 let text = value("[logger:=]level")?;
@@ -216,198 +194,21 @@ impl RosArgs {
     /// # Errors
     /// [`ArgsError::Name`] where a rule gives the node a name ROS does not allow.
     pub fn node(&self, namespace: &str, name: &str) -> Result<NodeNames, ArgsError> {
-        let rule = |keys: &[&str]| {
-            self.remaps
-                .iter()
-                .find(|r| keys.contains(&r.from.as_str()) && r.node.as_deref().is_none_or(|n| n == name))
-                .map(|r| r.to.clone())
-        };
-        let own = rule(&["__node", "__name"]).unwrap_or_else(|| name.to_owned());
-        let namespace = rule(&["__ns"]).unwrap_or_else(|| namespace.to_owned());
-        check_token(&own, &own)?;
-        let namespace = absolute_namespace(&namespace)?;
-        let remaps = self
-            .remaps
-            .iter()
-            .filter(|r| !r.from.starts_with("__") && r.node.as_deref().is_none_or(|n| n == own || n == name))
-            .cloned()
-            .collect();
-        Ok(NodeNames { namespace, name: own, remaps })
+        Ok(NodeNames::new(namespace, name, &self.remaps)?)
     }
 
     /// The values given to the parameters of a node, in the order in which they apply.
     pub fn overrides(&self, node: &NodeNames) -> Vec<Override> {
-        let full_name = node.full_name();
-        self.assignments
-            .iter()
-            .filter(|a| if a.node.contains('/') { matches(&a.node, &full_name) } else { a.node == node.name })
-            .map(|a| Override { name: a.name.clone(), value: a.value.clone(), addressed: a.addressed })
-            .collect()
-    }
-}
-
-/// The names of a node and of everything it opens.
-#[derive(Debug, Clone)]
-pub struct NodeNames {
-    namespace: String,
-    name: String,
-    remaps: Vec<Remap>,
-}
-
-impl NodeNames {
-    /// Namespace, absolute.
-    pub fn namespace(&self) -> &str {
-        &self.namespace
-    }
-
-    /// Name without the namespace.
-    pub fn name(&self) -> &str {
-        &self.name
-    }
-
-    /// Namespace and name.
-    pub fn full_name(&self) -> String {
-        join(&self.namespace, &self.name)
-    }
-
-    /// The absolute name of a topic after remapping; `name` may be relative, absolute or private (`~/`).
-    ///
-    /// # Errors
-    /// [`ArgsError::Name`] where the name or what it is remapped to breaks the rules of ROS names.
-    pub fn topic(&self, name: &str) -> Result<String, ArgsError> {
-        self.resolve(name, "rostopic://")
-    }
-
-    /// The absolute name of a service (or action) after remapping.
-    ///
-    /// # Errors
-    /// As for [`Self::topic`].
-    pub fn service(&self, name: &str) -> Result<String, ArgsError> {
-        self.resolve(name, "rosservice://")
-    }
-
-    fn resolve(&self, name: &str, scheme: &str) -> Result<String, ArgsError> {
-        let full_name = self.expand(name)?;
-        for rule in &self.remaps {
-            let from = match rule.from.split_once("://") {
-                Some(_) => match rule.from.strip_prefix(scheme) {
-                    Some(from) => from,
-                    None => continue,
-                },
-                None => &rule.from,
-            };
-            if self.expand(from)? == full_name {
-                return self.expand(&rule.to);
-            }
-        }
-        Ok(full_name)
-    }
-
-    fn expand(&self, name: &str) -> Result<String, ArgsError> {
-        let namespace = self.namespace.trim_end_matches('/');
-        let substituted =
-            name.replace("{node}", &self.name).replace("{ns}", namespace).replace("{namespace}", namespace);
-        let full_name = match substituted.as_str() {
-            "~" => self.full_name(),
-            s if s.starts_with("~/") => join(&self.full_name(), &s[2..]),
-            s if s.starts_with('/') => s.to_owned(),
-            s => join(&self.namespace, s),
-        };
-        check_name(&full_name, name)?;
-        Ok(full_name)
-    }
-}
-
-/// The DDS domain that `ROS_DOMAIN_ID` names, 0 where it is not set.
-///
-/// # Errors
-/// [`ArgsError::Environment`] for anything but a whole number of 0 to 232, the range for which the ports of RTPS exist.
-pub fn domain_id(variable: Option<&str>) -> Result<u16, ArgsError> {
-    const LAST_DOMAIN: u16 = 232;
-    match variable.map(str::trim) {
-        None | Some("") => Ok(0),
-        Some(text) => text.parse().ok().filter(|&id| id <= LAST_DOMAIN).ok_or_else(|| ArgsError::Environment {
-            variable: "ROS_DOMAIN_ID",
-            value: text.to_owned(),
-            rule: "must be a whole number of 0 to 232",
-        }),
-    }
-}
-
-fn join(namespace: &str, name: &str) -> String {
-    if namespace == "/" { format!("/{name}") } else { format!("{namespace}/{name}") }
-}
-
-fn absolute_namespace(namespace: &str) -> Result<String, ArgsError> {
-    let absolute = if namespace.starts_with('/') { namespace.to_owned() } else { format!("/{namespace}") };
-    if absolute != "/" {
-        check_name(&absolute, namespace)?;
-    }
-    Ok(absolute)
-}
-
-fn check_name(full_name: &str, given: &str) -> Result<(), ArgsError> {
-    let rule = |rule| Err(ArgsError::Name { name: given.to_owned(), rule });
-    let Some(tokens) = full_name.strip_prefix('/') else { return rule("must not be empty") };
-    if full_name.ends_with('/') {
-        return rule("must not end with '/'");
-    }
-    tokens.split('/').try_for_each(|token| check_token(token, given))
-}
-
-fn check_token(token: &str, given: &str) -> Result<(), ArgsError> {
-    let rule = |rule| Err(ArgsError::Name { name: given.to_owned(), rule });
-    match token.chars().next() {
-        None => rule("must hold no empty part (no '//')"),
-        Some(c) if c.is_ascii_digit() => rule("no part of it may start with a digit"),
-        Some(_) if !token.chars().all(|c| c.is_ascii_alphanumeric() || c == '_') => {
-            rule("may hold letters, digits, '_' and '/' alone")
-        }
-        Some(_) => Ok(()),
+        self.assignments.iter().filter_map(|assignment| assignment.given_to(node)).collect()
     }
 }
 
 /// Splits `[node:]from:=to` into the three; a `:` of `rostopic://` is not one of a node.
-fn split_rule(text: &str) -> Option<(Option<&str>, &str, &str)> {
-    let (left, right) = text.split_once(":=")?;
-    match left.split_once(':') {
-        Some((node, from)) if !from.starts_with("//") => Some((Some(node), from, right)),
-        _ => Some((None, left, right)),
-    }
-}
-
-fn parse_remap(text: &str) -> Result<Remap, ArgsError> {
-    let error = |reason: &str| ArgsError::Remap { rule: text.to_owned(), reason: reason.to_owned() };
-    let (node, from, to) = split_rule(text).ok_or_else(|| error("':=' is missing"))?;
-    if from.is_empty() || to.is_empty() || node == Some("") {
-        return Err(error("a part of it is empty"));
-    }
-    if from.starts_with("__") && !["__ns", "__node", "__name"].contains(&from) {
-        return Err(error("only __ns, __node and __name begin with '__'"));
-    }
-    // Any node will do to find out whether the names can be expanded at all.
-    let probe = NodeNames { namespace: "/".to_owned(), name: "node".to_owned(), remaps: Vec::new() };
-    let checked = match from {
-        "__ns" => absolute_namespace(to).map(drop),
-        "__node" | "__name" => check_token(to, to),
-        _ => probe.topic(from.split_once("://").map_or(from, |(_, name)| name)).and_then(|_| probe.topic(to)).map(drop),
-    };
-    checked.map_err(|e| error(&e.to_string()))?;
-    Ok(Remap { node: node.map(str::to_owned), from: from.to_owned(), to: to.to_owned() })
-}
-
-fn parse_assignment(text: &str) -> Result<Assignment, ArgsError> {
-    let error = |reason: String| ArgsError::Parameter { rule: text.to_owned(), reason };
-    let (node, name, value) = split_rule(text).ok_or_else(|| error("':=' is missing".to_owned()))?;
-    if name.is_empty() {
-        return Err(error("the name is empty".to_owned()));
-    }
-    let value = serde_yaml_ng::from_str(value).map_err(|e| error(format!("the value is not YAML: {e}")))?;
-    Ok(Assignment {
-        node: node.unwrap_or("/**").to_owned(),
-        addressed: true,
-        name: name.to_owned(),
-        value: parameter_value(&value).map_err(error)?,
+fn split_rule(text: &str) -> Result<(Option<&str>, &str, &str), String> {
+    let (left, right) = text.split_once(":=").ok_or("':=' is missing")?;
+    Ok(match left.split_once(':') {
+        Some((node, from)) if !from.starts_with("//") => (Some(node), from, right),
+        _ => (None, left, right),
     })
 }
 
@@ -421,128 +222,10 @@ fn parse_level(text: &str) -> Result<LevelFilter, ArgsError> {
     }
 }
 
-/// The ROS type of a YAML value: a scalar, or a sequence of scalars of one type.
-fn parameter_value(value: &Value) -> Result<ParameterValue, String> {
-    match value {
-        Value::Bool(b) => Ok(ParameterValue::Boolean(*b)),
-        Value::Number(n) => match (n.as_i64(), n.as_f64()) {
-            (Some(i), _) => Ok(ParameterValue::Integer(i)),
-            (None, Some(d)) if n.is_f64() => Ok(ParameterValue::Double(d)),
-            _ => Err(format!("{n} does not fit a 64-bit integer")),
-        },
-        Value::String(s) => Ok(ParameterValue::String(s.clone())),
-        Value::Tagged(tagged) => parameter_value(&tagged.value),
-        Value::Sequence(items) => sequence_value(items),
-        Value::Null => Err("it has no value".to_owned()),
-        Value::Mapping(_) => Err("a map is no value of a parameter".to_owned()),
-    }
-}
-
-fn sequence_value(items: &[Value]) -> Result<ParameterValue, String> {
-    let values: Vec<ParameterValue> = items.iter().map(parameter_value).collect::<Result<_, _>>()?;
-    let mixed = || "the values of a list must be of one type".to_owned();
-    match values.first() {
-        None => Ok(ParameterValue::StringArray(Vec::new())),
-        Some(ParameterValue::Boolean(_)) => values
-            .iter()
-            .map(|v| if let ParameterValue::Boolean(b) = v { Ok(*b) } else { Err(mixed()) })
-            .collect::<Result<_, _>>()
-            .map(ParameterValue::BooleanArray),
-        Some(ParameterValue::Integer(_)) => values
-            .iter()
-            .map(|v| if let ParameterValue::Integer(i) = v { Ok(*i) } else { Err(mixed()) })
-            .collect::<Result<_, _>>()
-            .map(ParameterValue::IntegerArray),
-        Some(ParameterValue::Double(_)) => values
-            .iter()
-            .map(|v| if let ParameterValue::Double(d) = v { Ok(*d) } else { Err(mixed()) })
-            .collect::<Result<_, _>>()
-            .map(ParameterValue::DoubleArray),
-        Some(ParameterValue::String(_)) => values
-            .iter()
-            .map(|v| if let ParameterValue::String(s) = v { Ok(s.clone()) } else { Err(mixed()) })
-            .collect::<Result<_, _>>()
-            .map(ParameterValue::StringArray),
-        Some(_) => Err("a list holds plain values alone".to_owned()),
-    }
-}
-
-fn read_parameters_file(file: &Path) -> Result<Vec<Assignment>, ArgsError> {
-    let error = |reason: String| ArgsError::ParametersFile { file: file.to_owned(), reason };
-    let text = std::fs::read_to_string(file).map_err(|e| error(e.to_string()))?;
-    parse_parameters(&text).map_err(error)
-}
-
-fn parse_parameters(text: &str) -> Result<Vec<Assignment>, String> {
-    let mut assignments = Vec::new();
-    match serde_yaml_ng::from_str(text).map_err(|e| format!("not YAML: {e}"))? {
-        Value::Mapping(nodes) => collect_nodes(&nodes, "", &mut assignments)?,
-        Value::Null => {}
-        _ => return Err("must be a map of node names".to_owned()),
-    }
-    Ok(assignments)
-}
-
-/// Node keys may nest (`ns:` `node:` `ros__parameters:`) and hold slashes and wildcards.
-fn collect_nodes(nodes: &serde_yaml_ng::Mapping, prefix: &str, found: &mut Vec<Assignment>) -> Result<(), String> {
-    for (key, value) in nodes {
-        let key = key.as_str().ok_or_else(|| format!("node name {key:?} is no text"))?;
-        let Value::Mapping(inner) = value else {
-            return Err(format!("'{key}' must hold 'ros__parameters'"));
-        };
-        if key == "ros__parameters" {
-            if prefix.is_empty() {
-                return Err("'ros__parameters' stands outside of any node".to_owned());
-            }
-            collect_parameters(inner, "", prefix, found)?;
-        } else {
-            collect_nodes(inner, &format!("{prefix}/{}", key.trim_matches('/')), found)?;
-        }
-    }
-    Ok(())
-}
-
-fn collect_parameters(
-    parameters: &serde_yaml_ng::Mapping,
-    prefix: &str,
-    node: &str,
-    found: &mut Vec<Assignment>,
-) -> Result<(), String> {
-    for (key, value) in parameters {
-        let key = key.as_str().ok_or_else(|| format!("parameter name {key:?} of {node} is no text"))?;
-        let name = format!("{prefix}{key}");
-        if let Value::Mapping(inner) = value {
-            collect_parameters(inner, &format!("{name}."), node, found)?;
-        } else {
-            let value = parameter_value(value).map_err(|e| format!("parameter '{name}' of {node}: {e}"))?;
-            let addressed = node.rsplit('/').next().is_some_and(|last| !last.contains('*'));
-            found.push(Assignment { node: node.to_owned(), addressed, name, value });
-        }
-    }
-    Ok(())
-}
-
-/// Whether a full node name fits a pattern in which `*` stands for one part and `**` for any number of them.
-fn matches(pattern: &str, full_name: &str) -> bool {
-    fn parts_match(pattern: &[&str], name: &[&str]) -> bool {
-        match (pattern.split_first(), name.split_first()) {
-            (None, None) => true,
-            (Some((&"**", rest)), _) => (0..=name.len()).any(|skip| parts_match(rest, &name[skip..])),
-            (Some((&"*", rest)), Some((_, name))) => parts_match(rest, name),
-            (Some((part, rest)), Some((token, name))) => part == token && parts_match(rest, name),
-            _ => false,
-        }
-    }
-    let split =
-        |text: &'_ str| -> Vec<String> { text.split('/').filter(|part| !part.is_empty()).map(str::to_owned).collect() };
-    let (pattern, name) = (split(pattern), split(full_name));
-    let pattern: Vec<&str> = pattern.iter().map(String::as_str).collect();
-    let name: Vec<&str> = name.iter().map(String::as_str).collect();
-    parts_match(&pattern, &name)
-}
-
 #[cfg(test)]
 mod tests {
+    use ros2_client::ParameterValue;
+
     use super::*;
 
     fn parse(args: &[&str]) -> RosArgs {
@@ -655,7 +338,7 @@ cell:
   ros__parameters: {missed: 1}
 ";
         let mut args = parse(&[]);
-        args.assignments = parse_parameters(text).unwrap();
+        args.assignments = parse_file(text).unwrap();
         let names = |namespace: &str| -> Vec<String> {
             let node = args.node(namespace, "eye").unwrap();
             args.overrides(&node).into_iter().map(|o| o.name).collect()
@@ -684,30 +367,6 @@ cell:
         ] {
             let message = error(args);
             assert!(message.contains(said) && !message.contains('\n'), "{args:?}: {message}");
-        }
-    }
-
-    #[test]
-    fn broken_parameter_files_are_refused() {
-        for (text, said) in [
-            ("[1, 2]", "map of node names"),
-            ("node: 1", "'node' must hold"),
-            ("ros__parameters: {a: 1}", "outside of any node"),
-            ("node: {ros__parameters: {a: [1, b]}}", "'a' of /node"),
-            ("a: [", "not YAML"),
-        ] {
-            let message = parse_parameters(text).unwrap_err();
-            assert!(message.contains(said), "{text}: {message}");
-        }
-        assert!(parse_parameters("").unwrap().is_empty());
-    }
-
-    #[test]
-    fn the_domain_is_a_number_in_range() {
-        assert_eq!(domain_id(None).unwrap(), 0);
-        assert_eq!(domain_id(Some("42")).unwrap(), 42);
-        for bad in ["233", "-1", "x", "1.5"] {
-            assert!(domain_id(Some(bad)).unwrap_err().to_string().contains(bad));
         }
     }
 

@@ -14,7 +14,8 @@ use ros2_client::builtin_interfaces::Time;
 use ros2_client::ros2::LogLevel;
 use ros2_client::{NodeLoggingHandle, RosoutRaw};
 
-use super::args::{NodeNames, RosArgs};
+use super::args::RosArgs;
+use super::names::NodeNames;
 
 const NANOS: i64 = 1_000_000_000;
 

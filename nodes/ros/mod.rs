@@ -6,7 +6,9 @@
 //! | module | what stands there, and nowhere else |
 //! | --- | --- |
 //! | [`actions`] | goals as a stream |
-//! | [`args`] | the command line of ROS: remapping, parameters, names |
+//! | [`args`] | the command line of ROS |
+//! | [`names`] | names of nodes, topics and services, and what remaps them |
+//! | [`assignments`] | values given to parameters on the command line and in files |
 //! | [`params`] | declaration, check and documentation of parameters |
 //! | [`services`] | the six parameter services |
 //! | [`activity`] | whether a node works now, and what becomes of its inputs while it does not |
@@ -36,6 +38,7 @@
 pub mod actions;
 pub mod activity;
 pub mod args;
+pub mod assignments;
 pub mod clock;
 pub mod discovery;
 pub mod exit;
@@ -46,6 +49,7 @@ mod large;
 pub mod lifecycle;
 pub mod logging;
 mod missed;
+pub mod names;
 pub mod node_params;
 pub mod params;
 mod participant;

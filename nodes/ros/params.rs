@@ -10,7 +10,7 @@ use futures::channel::mpsc;
 use ros2_client::ParameterValue;
 use ros2_client::parameters::raw;
 
-use super::args::Override;
+use super::assignments::Override;
 
 /// Default value of a parameter; its variant is the type.
 #[derive(Debug, Clone, Copy, PartialEq)]

@@ -10,7 +10,7 @@ use std::time::Duration;
 use ros2_client::Context;
 use rustdds::{DomainParticipant, DomainParticipantBuilder, RTPSEntity};
 
-use super::args::{ArgsError, domain_id};
+use super::args::ArgsError;
 use super::discovery::Endpoints;
 use super::exit::ProcessError;
 use super::farewell::Farewell;
@@ -112,6 +112,22 @@ fn say_farewell(farewell: &Farewell, secured: bool) {
     }
 }
 
+/// The DDS domain that `ROS_DOMAIN_ID` names, 0 where it is not set.
+///
+/// # Errors
+/// [`ArgsError::Environment`] for anything but a whole number of 0 to 232, the range for which the ports of RTPS exist.
+fn domain_id(variable: Option<&str>) -> Result<u16, ArgsError> {
+    const LAST_DOMAIN: u16 = 232;
+    match variable.map(str::trim) {
+        None | Some("") => Ok(0),
+        Some(text) => text.parse().ok().filter(|&id| id <= LAST_DOMAIN).ok_or_else(|| ArgsError::Environment {
+            variable: "ROS_DOMAIN_ID",
+            value: text.to_owned(),
+            rule: "must be a whole number of 0 to 232",
+        }),
+    }
+}
+
 /// The addresses that the parameter or the environment restricts the middleware to; none for no restriction.
 fn interfaces(
     parameters: &Parameters,
@@ -154,4 +170,18 @@ fn static_peers(parameters: &Parameters, environment: Option<String>) -> Result<
             })
         })
         .collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_domain_is_a_number_in_range() {
+        assert_eq!(domain_id(None).unwrap(), 0);
+        assert_eq!(domain_id(Some("42")).unwrap(), 42);
+        for bad in ["233", "-1", "x", "1.5"] {
+            assert!(domain_id(Some(bad)).unwrap_err().to_string().contains(bad));
+        }
+    }
 }

@@ -15,10 +15,10 @@ use ros2_client::{Context, MessageInfo, MessageTypeName, Node, QosProfile, Subsc
 use rustdds::{GUID, RTPSEntity};
 
 use super::activity::Activity;
-use super::args::{ArgsError, NodeNames};
 use super::clock::Clock;
 use super::discovery::{Audience, Endpoints, LesserWriter, Offer};
 use super::health::Health;
+use super::names::{NameError, NodeNames};
 use super::params::Parameters;
 use super::topics::{TOPIC_PREFIX, Topic};
 
@@ -32,7 +32,7 @@ pub const CHANNEL_DEPTH: usize = 4;
 pub enum SessionError {
     /// A name that ROS does not allow.
     #[error(transparent)]
-    Name(#[from] ArgsError),
+    Name(#[from] NameError),
     /// The middleware refused something.
     #[error("{what}: {reason}")]
     Middleware {
