@@ -11,11 +11,14 @@
 //! | [`isthmus`] | border, skeleton | [`isthmus::Isthmus`]es with critical points and match segment |
 //! | [`profile`] | isthmus, border | isthmus distance function (IDF) |
 //!
+//! The convex hull of points stands in [`hull`].
+//!
 //! Coordinates are pixels of the source frame: x right, y **down**, pixel centres at whole numbers.
 
 mod changes;
 pub mod contour;
 mod cutout;
+pub mod hull;
 pub mod isthmus;
 pub mod mask;
 pub mod profile;

@@ -4,8 +4,8 @@
 //! Coordinates are pixels of the piece's image (x right, y down) unless said otherwise.
 
 use crate::Piece;
-use isthmus::Point;
 use isthmus::isthmus::{Isthmus, Polarity};
+use isthmus::{Point, hull};
 use nalgebra::Vector2;
 
 /// Samples of an IDF in the shape index: enough for a tab (its finest feature is about a tenth of its path).
@@ -420,28 +420,10 @@ fn drop_inner(points: &mut Vec<Point>) {
     });
 }
 
-/// Convex hull (Andrew 1979), running so that the turn is never negative.
+/// Convex hull, running so that the turn is never negative.
 pub(crate) fn convex_hull(mut points: Vec<Point>) -> Vec<Point> {
     drop_inner(&mut points);
-    points.sort_by(|p, q| p.x.total_cmp(&q.x).then(p.y.total_cmp(&q.y)));
-    let half = |points: &mut dyn Iterator<Item = Point>| {
-        let mut hull: Vec<Point> = Vec::new();
-        for p in points {
-            while hull.len() > 1 {
-                let (a, b) = (hull[hull.len() - 2], hull[hull.len() - 1]);
-                if (b - a).perp(&(p - a)) > 0.0 {
-                    break;
-                }
-                hull.pop();
-            }
-            hull.push(p);
-        }
-        hull.pop();
-        hull
-    };
-    let mut hull = half(&mut points.iter().copied());
-    hull.extend(half(&mut points.iter().rev().copied()));
-    hull
+    hull::convex_hull(&points).into_iter().map(|k| points[k]).collect()
 }
 
 impl Raster {

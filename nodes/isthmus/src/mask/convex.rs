@@ -1,14 +1,14 @@
 //! Convex shapes among others: coins, labels, cards, rulers, boxes.
 //!
 //! What interlocks has bays: of 404 real pieces each has one of a fifth of its size, of generated pieces with a single neck each one of a twelfth. A shape
-//! without any is of another kind. Two looks: the area between the outermost ends of rows beside that of the hull of these (A. M. Andrew, *Another efficient algorithm
-//! for convex hulls in two dimensions*, Inf. Proc. Letters 9, 1979), linear in the rows, which few shapes with bays pass; then the depth of the bays of
-//! the border itself.
+//! without any is of another kind. Two looks: the area between the outermost ends of rows beside that of the hull of these, linear in the
+//! rows, which few shapes with bays pass; then the depth of the bays of the border itself.
 
 use super::runs::{Component, Run};
 use crate::Point;
 use crate::contour::Border;
 use crate::cutout::Cutout;
+use crate::hull::{convex_hull, half};
 
 /// Rows of a shape that are looked at, about: between any two of them a convex shape is so but for a thousandth of its area.
 const ROWS: usize = 48;
@@ -39,17 +39,8 @@ pub(super) fn may_be_convex<'a>(component: &Component, runs: impl Iterator<Item 
 
 /// Twice the area below the least concave line above some heights that are a step apart.
 fn area_below_hull(heights: &[i64]) -> i64 {
-    let mut hull: Vec<[i64; 2]> = Vec::with_capacity(heights.len());
-    for (at, height) in heights.iter().enumerate() {
-        let next = [at as i64, *height];
-        while let [.., a, b] = hull[..] {
-            if (b[1] - a[1]) * (next[0] - a[0]) > (next[1] - a[1]) * (b[0] - a[0]) {
-                break;
-            }
-            hull.pop();
-        }
-        hull.push(next);
-    }
+    let points = heights.iter().enumerate().map(|(at, height)| [at as i64, *height]);
+    let hull = half(points, |a, b, c| (b[1] - a[1]) * (c[0] - a[0]) > (c[1] - a[1]) * (b[0] - a[0]));
     hull.windows(2).map(|w| (w[1][0] - w[0][0]) * (w[0][1] + w[1][1])).sum()
 }
 
@@ -62,31 +53,13 @@ pub(super) fn is_convex(cutout: &Cutout) -> bool {
 
 /// Depth of the deepest bay of a border: the greatest distance of one of its points from the hull.
 fn bay_depth(border: &[Point]) -> f64 {
-    let cross = |a: Point, b: Point, c: Point| (b - a).perp(&(c - a));
-    let mut order: Vec<usize> = (0..border.len()).collect();
-    order.sort_unstable_by(|a, b| border[*a].x.total_cmp(&border[*b].x).then(border[*a].y.total_cmp(&border[*b].y)));
-    let mut hull: Vec<usize> = Vec::new();
-    for _ in 0..2 {
-        let from = hull.len();
-        for &k in &order {
-            while let [.., a, b] = hull[from..] {
-                if cross(border[a], border[b], border[k]) > 0.0 {
-                    break;
-                }
-                hull.pop();
-            }
-            hull.push(k);
-        }
-        // The last point of one half is the first one of the other.
-        hull.pop();
-        order.reverse();
-    }
+    let mut hull = convex_hull(border);
     // The hull's points follow each other as they do along the border, with a bay between any two.
     hull.sort_unstable();
     let bay = |(from, to): (usize, usize)| {
         let (a, b) = (border[from], border[to]);
         let points = border.iter().cycle().skip(from).take((to + border.len() - from) % border.len());
-        points.map(|p| cross(a, b, *p).abs() / (b - a).norm().max(f64::MIN_POSITIVE)).fold(0.0, f64::max)
+        points.map(|p| (b - a).perp(&(p - a)).abs() / (b - a).norm().max(f64::MIN_POSITIVE)).fold(0.0, f64::max)
     };
     let next = hull.iter().copied().cycle().skip(1);
     hull.iter().copied().zip(next).map(bay).fold(0.0, f64::max)
