@@ -18,6 +18,7 @@ use crate::bag::cli::BagCommand;
 use crate::cell::CellArgs;
 use crate::console::{complain, say};
 use crate::offline::{self, OfflineError, Progress};
+use crate::results::ASSEMBLY_FILE;
 use crate::watch::WatchArgs;
 
 /// Everything is done.
@@ -327,7 +328,7 @@ fn assemble(args: &AssembleArgs) -> Result<u8, CliError> {
         seconds.r#match,
         seconds.assemble,
     ));
-    display.say(&format!("{}", args.out.join("assembly.json").display()));
+    display.say(&format!("{}", args.out.join(ASSEMBLY_FILE).display()));
     Ok(if outcome.is_complete() { DONE } else { PARTIAL })
 }
 

@@ -14,10 +14,10 @@ pub(crate) const MAX_SIDE_PX: u32 = 32_768;
 pub(crate) const MAX_AREA_PX: u64 = 150_000_000;
 
 /// Longest name of a frame or a source, in bytes; far more than anyone writes, and little enough to be kept.
-pub(crate) const MAX_NAME_LENGTH: usize = 1024;
+const MAX_NAME_LENGTH: usize = 1024;
 
 /// A field that breaks a rule: field, value, rule.
-pub(crate) type Fault = (&'static str, String, &'static str);
+type Fault = (&'static str, String, &'static str);
 
 /// Whether a text can be taken over into messages and logs.
 pub(crate) fn text_fault(field: &'static str, text: &str) -> Option<Fault> {

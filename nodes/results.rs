@@ -1,4 +1,4 @@
-//! Files of results: the form of `assembly.json`, and files written beside their place and renamed, so that a reader never sees
+//! Files of results: their names, the form of `assembly.json`, and files written beside their place and renamed, so that a reader never sees
 //! half a file.
 
 use std::fs;
@@ -8,6 +8,13 @@ use std::path::{Path, PathBuf};
 use isthmus::mask;
 use jigsaw::TableCounts;
 use serde::Serialize;
+
+/// Where the pieces of a puzzle belong.
+pub(crate) const ASSEMBLY_FILE: &str = "assembly.json";
+/// The picture of that.
+pub(crate) const ASSEMBLY_PICTURE: &str = "assembly.png";
+/// Ending of the pictures of pieces and frames.
+pub(crate) const OVERLAY_ENDING: &str = "_overlay.png";
 
 /// A file that can't be written.
 #[derive(Debug, thiserror::Error)]

@@ -22,8 +22,8 @@ use nalgebra::{Isometry2, Point2, Vector2};
 
 use crate::console::{complain, say};
 use crate::results::{
-    AoiRecord, AssemblyFile, MatingRecord, PlacedRecord, PoseRecord, Seconds, SideRecord, WriteError, make_folder,
-    write_file, write_json,
+    ASSEMBLY_FILE, ASSEMBLY_PICTURE, AoiRecord, AssemblyFile, MatingRecord, PlacedRecord, PoseRecord, Seconds,
+    SideRecord, WriteError, make_folder, write_file, write_json,
 };
 use crate::ros::exit::exit_code;
 use crate::ros::process::Process;
@@ -238,9 +238,9 @@ fn table(assembly: &AssemblyMessage, pieces: Option<usize>) -> String {
 /// Writes what was heard.
 fn write(out: &Path, assembly: &AssemblyMessage, heard: &Heard) -> Result<(), WriteError> {
     make_folder(out)?;
-    write_json(&out.join("assembly.json"), &in_pixels(assembly, &heard.features))?;
+    write_json(&out.join(ASSEMBLY_FILE), &in_pixels(assembly, &heard.features))?;
     if let Some(png) = heard.picture.as_ref().and_then(png) {
-        write_file(&out.join("assembly.png"), |file| file.write_all(&png))?;
+        write_file(&out.join(ASSEMBLY_PICTURE), |file| file.write_all(&png))?;
     }
     Ok(())
 }

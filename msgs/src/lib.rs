@@ -59,11 +59,6 @@ impl MessageType {
         let index = MESSAGE_TYPES.binary_search_by_key(&full_name, |known| known.full_name).ok()?;
         MESSAGE_TYPES.get(index)
     }
-
-    /// The type of a name on DDS, such as `sensor_msgs::msg::dds_::Image_`.
-    pub fn find_dds(dds_name: &str) -> Option<&'static Self> {
-        MESSAGE_TYPES.iter().find(|known| known.dds_name == dds_name)
-    }
 }
 
 /// A message, or one of the structures of a service or an action.

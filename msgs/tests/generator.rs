@@ -197,7 +197,6 @@ fn rust_types_and_definition_files_say_the_same() {
 fn types_are_found_by_name() {
     for known in MESSAGE_TYPES {
         assert_eq!(MessageType::find(known.full_name), Some(known));
-        assert_eq!(MessageType::find_dds(known.dds_name), Some(known));
     }
     assert_eq!(MessageType::find("std_msgs/msg/Nonsense"), None);
     assert!(visit("std_msgs/msg/Nonsense", DefaultFields).is_none());

@@ -12,9 +12,6 @@ pub const HEADER_LEN: usize = 4;
 /// Header of plain little-endian CDR, which is what ROS 2 writes.
 pub const LITTLE_ENDIAN_HEADER: [u8; HEADER_LEN] = [0, 1, 0, 0];
 
-/// Header of plain big-endian CDR.
-pub const BIG_ENDIAN_HEADER: [u8; HEADER_LEN] = [0, 0, 0, 0];
-
 /// Byte order of a CDR message.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum ByteOrder {

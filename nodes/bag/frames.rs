@@ -26,7 +26,7 @@ use super::{BagError, BagWriter, Compression, QosProfile, Storage, Topic, TopicI
 pub const TOPIC: &str = "/image/compressed";
 
 /// Frame of the camera, as the header names it.
-pub const FRAME_ID: &str = "camera";
+const FRAME_ID: &str = "camera";
 
 /// History depth of the publisher that a bag of frames stands for.
 const DEPTH: u32 = 10;

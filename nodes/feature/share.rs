@@ -115,7 +115,7 @@ impl Share {
 
     /// The results of nodes that have gone or are silent, where this node is the one to keep them for those who come later,
     /// and for those whom they have not reached yet.
-    pub fn inherit(&mut self, others: &[GUID]) -> Vec<PieceFeatures> {
+    fn inherit(&mut self, others: &[GUID]) -> Vec<PieceFeatures> {
         let alive: HashSet<Member> = others.iter().map(|other| other.to_bytes()).collect();
         let silent = &self.silent;
         let gone = self.results.iter().filter(|(_, (by, _))| !alive.contains(by) || silent.contains(by));

@@ -3,11 +3,11 @@
 use std::fs;
 use std::path::{Path, PathBuf};
 
-use super::records::{ASSEMBLY_PICTURE, OVERLAY_ENDING};
 use super::report::{OfflineError, Progress};
 use crate::bag::{BagReader, RawMessage, Selection, Storage, TopicCount, cdr};
 use crate::capture::convert::{self, Picture};
 use crate::capture::source::{Frame, PICTURE_ENDINGS};
+use crate::results::{ASSEMBLY_PICTURE, OVERLAY_ENDING};
 
 /// Types of the messages that are pictures.
 const RAW_IMAGE: &str = "sensor_msgs/msg/Image";

@@ -26,12 +26,14 @@ use rayon::prelude::*;
 
 use crate::capture::cut::Pixels;
 use crate::picture;
-use crate::results::{AssemblyFile, make_folder, write_json, write_png};
+use crate::results::{
+    ASSEMBLY_FILE, ASSEMBLY_PICTURE, AssemblyFile, OVERLAY_ENDING, make_folder, write_json, write_png,
+};
 pub use crate::results::{Seconds, WriteError};
 pub use generated::{write_bag, write_images};
 use inputs::find_inputs;
 use look::{Seen, look};
-use records::{ASSEMBLY_PICTURE, FeaturesRecord, OVERLAY_ENDING, write_csv};
+use records::{FeaturesRecord, write_csv};
 pub use report::{OfflineError, Progress};
 
 /// What became of [`assemble`].
@@ -100,7 +102,7 @@ pub fn assemble(
 
     progress.stage("writing", 3);
     let pieces = solver.pieces();
-    write_json(&out.join("assembly.json"), &AssemblyFile::new(pieces, &known, &assembly, seconds))?;
+    write_json(&out.join(ASSEMBLY_FILE), &AssemblyFile::new(pieces, &known, &assembly, seconds))?;
     progress.step();
     write_csv(&out.join("matches.csv"), pieces, &solver.candidates())?;
     progress.step();

@@ -1,4 +1,4 @@
-//! What a run writes: `assembly.json`, `features.json` and `matches.csv`, and the names of its pictures.
+//! What stands in the `assembly.json`, `features.json` and `matches.csv` of a run.
 
 use std::path::Path;
 
@@ -14,10 +14,6 @@ use crate::results::{
     AoiRecord, AssemblyFile, MatingRecord, PlacedRecord, PoseRecord, Seconds, SideRecord, WriteError, write_file,
 };
 
-/// Ending of the pictures of pieces and frames.
-pub(super) const OVERLAY_ENDING: &str = "_overlay.png";
-/// Name of the picture of the assembly.
-pub(super) const ASSEMBLY_PICTURE: &str = "assembly.png";
 /// Samples of an isthmus distance function in `features.json`.
 const IDF_SAMPLES: usize = 64;
 

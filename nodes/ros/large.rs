@@ -8,7 +8,7 @@
 //!
 //! What RustDDS sends whole must not be sent from here: Fast DDS notes in the content of a message which of its fragments are still
 //! missing, and such notes stay in it where the whole message comes between them. So which way RustDDS goes is told as it does
-//! (`Writer::max_unfragmented_serialized_payload`), by what the interfaces on the way carry.
+//! (`Writer::max_unfragmented_serialized_payload`, which it keeps to itself), by what the interfaces on the way carry.
 
 use std::net::{IpAddr, Ipv4Addr, SocketAddr, UdpSocket};
 use std::time::Duration;

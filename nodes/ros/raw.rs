@@ -38,7 +38,7 @@ pub fn dds_type_name(ros: &str) -> Option<String> {
 }
 
 /// A DDS type name as ROS knows it; `None` for the type of a service, an action or of something that is not ROS.
-pub fn ros_type_name(dds: &str) -> Option<String> {
+fn ros_type_name(dds: &str) -> Option<String> {
     let (package, name) = dds.split_once(DDS_TYPE_PART)?;
     Some(format!("{package}/msg/{}", name.strip_suffix('_')?))
 }

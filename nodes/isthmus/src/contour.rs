@@ -206,21 +206,6 @@ impl Border {
         self.points[i] + (self.points[j] - self.points[i]) * t
     }
 
-    /// Unit tangent at an arc length, in the direction of the border.
-    #[must_use]
-    pub fn tangent_at(&self, arc: f64) -> Vector2<f64> {
-        let d = self.point_at(arc + self.spacing) - self.point_at(arc - self.spacing);
-        let norm = d.norm();
-        if norm > 0.0 { d / norm } else { Vector2::x() }
-    }
-
-    /// Unit normal at an arc length, out of the shape.
-    #[must_use]
-    pub fn normal_at(&self, arc: f64) -> Vector2<f64> {
-        let t = self.tangent_at(arc);
-        Vector2::new(t.y, -t.x)
-    }
-
     /// Arc length from `from` forward to `to`, in `0..length` (wraps round).
     #[must_use]
     pub fn forward(&self, from: f64, to: f64) -> f64 {
@@ -516,7 +501,7 @@ fn pad(cutout: &Cutout, level: f32, padded: &mut Vec<u8>) -> usize {
     if !touches {
         return 0;
     }
-    let ground = cutout.ground_level.round().clamp(0.0, 255.0) as u8;
+    let ground = cutout.ground_level.round() as u8;
     let padded_width = width + 2 * MARGIN;
     padded.clear();
     padded.resize(padded_width * (height + 2 * MARGIN), ground);

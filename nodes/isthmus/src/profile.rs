@@ -27,14 +27,6 @@ use crate::isthmus::Isthmus;
 /// first and last are the critical points.
 #[must_use]
 pub fn distance_function(border: &Border, isthmus: &Isthmus, count: usize) -> Vec<f64> {
-    extended_distance_function(border, isthmus, 0.0, count)
-}
-
-/// As [`distance_function`], of the match segment made longer by `extension` pixels at both ends (the shoulders).
-#[must_use]
-pub fn extended_distance_function(border: &Border, isthmus: &Isthmus, extension: f64, count: usize) -> Vec<f64> {
-    let path = isthmus.path_length + 2.0 * extension;
-    let step = if count > 1 { path / (count - 1) as f64 } else { 0.0 };
-    let start = isthmus.arc[0] - extension;
-    (0..count).map(|i| (border.point_at(start + i as f64 * step) - isthmus.point).norm()).collect()
+    let step = if count > 1 { isthmus.path_length / (count - 1) as f64 } else { 0.0 };
+    (0..count).map(|i| (border.point_at(isthmus.arc[0] + i as f64 * step) - isthmus.point).norm()).collect()
 }

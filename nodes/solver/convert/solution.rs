@@ -44,7 +44,7 @@ pub struct Solution {
 
 impl Solution {
     /// The puzzle in metres: origin at the bottom left corner of the assembly.
-    pub fn puzzle_plane(&self) -> PixelPlane {
+    fn puzzle_plane(&self) -> PixelPlane {
         let corner = self
             .assembly
             .placements
