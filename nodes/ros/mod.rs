@@ -5,34 +5,38 @@
 //!
 //! | module | what stands there, and nowhere else |
 //! | --- | --- |
-//! | [`actions`] | goals as a stream |
+//! | **a process** | |
+//! | [`process`] | one process: signals, nodes, end |
+//! | `participant` | how it joins its domain and leaves it: interfaces, static peers, security |
+//! | `turn` | the processes of a host join a domain one after the other |
+//! | `security` | keystore and enclave of SROS2 |
+//! | [`peers`] | discovery without multicast |
+//! | `farewell` | says that a process leaves |
+//! | `watchdog` | a process that has gone deaf, or whose loop stands still |
+//! | [`exit`] | why a process ends, and its exit code |
+//! | **what it is told** | |
 //! | [`args`] | the command line of ROS |
 //! | [`names`] | names of nodes, topics and services, and what remaps them |
 //! | [`assignments`] | values given to parameters on the command line and in files |
 //! | [`params`] | declaration, check and documentation of parameters |
-//! | [`services`] | the six parameter services |
+//! | [`node_params`] | the parameters that every node has |
+//! | **a node** | |
+//! | [`session`] | one node: opens topics as streams and sinks |
+//! | [`topics`] | every topic: message type, name, quality of service |
+//! | [`discovery`] | who listens, who offers or asks for too little, who was forgotten and comes back |
 //! | [`activity`] | whether a node works now, and what becomes of its inputs while it does not |
-//! | [`lifecycle`] | states and transitions of a managed node |
-//! | `security` | keystore and enclave of SROS2 |
+//! | [`clock`] | the system's time, or that of `/clock` |
+//! | [`health`] | counters of a node, published as `/diagnostics` |
+//! | [`logging`] | log lines to the console and `/rosout`, throttled warnings |
+//! | **what a node can do beside** | |
 //! | `server` | one service: requests in, answers out |
 //! | `large` | answers that do not fit a datagram |
 //! | `missed` | asks a client's writer for the request that came before it was known |
-//! | [`topics`] | every topic: message type, name, quality of service |
-//! | [`raw`] | topics whose type is known by name only |
-//! | [`session`] | one node: opens topics and services as streams and sinks |
-//! | [`discovery`] | who listens, who offers or asks for too little, who was forgotten and comes back |
+//! | [`services`] | the six parameter services |
+//! | [`lifecycle`] | states and transitions of a managed node |
+//! | [`actions`] | goals as a stream |
 //! | [`kept`] | latched pieces, and which of them are forgotten |
-//! | [`peers`] | discovery without multicast |
-//! | `farewell` | says that a process leaves |
-//! | `turn` | the processes of a host join a domain one after the other |
-//! | `participant` | how a process joins its domain and leaves it: interfaces, static peers, security |
-//! | [`process`] | one process: signals, nodes, end |
-//! | `watchdog` | a process that has gone deaf, or whose loop stands still |
-//! | [`exit`] | why a process ends, and its exit code |
-//! | [`node_params`] | the parameters that every node has |
-//! | [`clock`] | the system's time, or that of `/clock` |
-//! | [`logging`] | log lines to the console and `/rosout`, throttled warnings |
-//! | [`health`] | counters of a node, published as `/diagnostics` |
+//! | [`raw`] | topics whose type is known by name only |
 //! | [`transforms`] | pixels (y down) to metres (y up) |
 
 pub mod actions;
