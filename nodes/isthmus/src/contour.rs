@@ -290,7 +290,8 @@ impl Border {
     /// Fills the border with equally spaced points, about `self.spacing` apart; `at` gives the point between two corners of a
     /// polygon, from the first one's index and how far between them.
     fn resample_by(&mut self, polygon: &[Point], at: impl Fn(usize, f64) -> Point) -> Result<(), ContourError> {
-        let length: f64 = edges(polygon).map(|(p, q)| (q - p).norm()).sum();
+        let chords: Vec<f64> = edges(polygon).map(|(p, q)| (q - p).norm()).collect();
+        let length: f64 = chords.iter().sum();
         let spacing = self.spacing;
         let count = (length / spacing).round();
         if count < MIN_POINTS as f64 {
@@ -304,8 +305,8 @@ impl Border {
         self.points.clear();
         self.points.reserve(count);
         let mut start = 0.0;
-        for (i, (p, q)) in edges(polygon).enumerate() {
-            let end = start + (q - p).norm();
+        for (i, chord) in chords.iter().enumerate() {
+            let end = start + chord;
             // The next sample's position is computed, not summed, so that long borders do not drift.
             let mut next = self.points.len() as f64 * self.spacing;
             while next < end && self.points.len() < count {
@@ -332,7 +333,7 @@ impl Border {
 
 /// The edges of a closed polygon.
 fn edges(points: &[Point]) -> impl Iterator<Item = (&Point, &Point)> {
-    points.iter().zip(points.iter().cycle().skip(1))
+    points.windows(2).map(|pair| (&pair[0], &pair[1])).chain(points.last().zip(points.first()))
 }
 
 /// Signed area of a closed polygon: positive for one that runs clockwise as seen on a screen (y down).
@@ -420,11 +421,11 @@ impl Tracer {
         if !self.contours.trace(&Raster { picture: first, level, contrast, sense, aliasing: 0.0 }, &self.starts) {
             return None;
         }
-        let edge_blur_in = |raw: Raw<'_>, contour: &[Point]| {
-            let own = edge_blur(contour, f64::from(contrast), |p| f64::from(sense) * raw.between(p)) * raw.step;
+        let edge_blur_in = |raw: Raw<'_>, contour: &[Point], about: Option<f64>| {
+            let own = edge_blur(contour, f64::from(contrast), about, |p| f64::from(sense) * raw.between(p)) * raw.step;
             (own * own - raw.variance()).max(0.0).sqrt()
         };
-        let mut optical = edge_blur_in(first, &self.contours.longest);
+        let mut optical = edge_blur_in(first, &self.contours.longest, None);
         let late = needed_blur(optical, noise);
         if late > 0.0 {
             let second = half.filter(|_| late >= HALVING_BLUR).unwrap_or(full);
@@ -440,7 +441,7 @@ impl Tracer {
             for p in &mut self.contours.longest {
                 *p = second.in_full(*p);
             }
-            optical = edge_blur_in(full, &self.contours.longest);
+            optical = edge_blur_in(full, &self.contours.longest, Some(optical));
         }
         let offset =
             Vector2::new(f64::from(cutout.window.x) - margin as f64, f64::from(cutout.window.y) - margin as f64);

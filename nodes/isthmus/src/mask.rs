@@ -94,7 +94,7 @@ impl Segmenter {
         let blocks = std::mem::take(&mut self.blocks);
         let mut found: Vec<(bool, Segmentation)> = Vec::new();
         for (candidate, is_told) in ground::candidates(&blocks) {
-            let ground = ground::find(frame, &blocks, candidate, std::mem::take(&mut self.residual));
+            let ground = ground::find(&blocks, candidate, std::mem::take(&mut self.residual));
             let (segmentation, has_bays) = self.shapes(frame, &blocks, &ground, parameters);
             self.residual = ground.residual;
             // A convex sheet that fills the frame is ground; what was taken for ground lies along the rim: the walls of a tray.
@@ -170,6 +170,7 @@ impl Segmenter {
             }
             self.collect(frame, parameters, shaded, &mut found, &mut rejected);
         }
+        standing::release(blocks, &self.coarse, &mut self.owner);
         sift(frame, parameters, found, rejected)
     }
 

@@ -139,8 +139,9 @@ pub(super) fn noise_power(variance: f64, late_blur: f64, step: usize) -> f64 {
 }
 
 /// Standard deviation of the blur of a picture's edge along a contour, in pixels, from the mean difference of the grey levels on either
-/// side; `level` gives the grey level at a point, larger ones in the shape, and `contrast` is that of shape and ground.
-pub(super) fn edge_blur(contour: &[Point], contrast: f64, level: impl Fn(Point) -> f64) -> f64 {
+/// side; `level` gives the grey level at a point, larger ones in the shape, and `contrast` is that of shape and ground. `about` is what the blur is
+/// expected to be, if it is.
+pub(super) fn edge_blur(contour: &[Point], contrast: f64, about: Option<f64>, level: impl Fn(Point) -> f64) -> f64 {
     /// Points of the contour that are looked at, about: the mean gets no better by more.
     const SAMPLES: usize = 256;
     /// Distance of the points that give a contour's direction: longer than the wiggles of noise.
@@ -165,7 +166,7 @@ pub(super) fn edge_blur(contour: &[Point], contrast: f64, level: impl Fn(Point) 
         if count > 0.0 { sum / count / contrast } else { 1.0 }
     };
     let blur_at = |reach: f64| reach / (std::f64::consts::SQRT_2 * inverse_error_function(difference(reach)));
-    let first = blur_at(REACH[0]);
+    let first = about.filter(|blur| *blur > REACH[0]).unwrap_or_else(|| blur_at(REACH[0]));
     let measured = if first > REACH[0] { blur_at(first.min(REACH[1])) } else { first };
     (measured * measured - INTERPOLATION).max(0.0).sqrt()
 }

@@ -6,6 +6,9 @@ use crate::wide::widely;
 /// Blocks that are looked at to find the ground: a shape of a thousandth of the frame still has several among them.
 const SAMPLES: usize = 5_000;
 
+/// Every so many of them tell the noise: a median of a thousand is known to a thirtieth.
+pub(super) const NOISE_STEP: usize = 4;
+
 /// A block that is looked at.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Sample {
@@ -30,7 +33,10 @@ pub(super) struct Blocks {
     pub(super) sample_step: usize,
     /// Their means, plane by plane.
     pub(super) sampled: Vec<Vec<f32>>,
+    /// By how much the first pixel of every [`NOISE_STEP`]th of them differs from the next one.
+    pub(super) steps: Vec<u8>,
     sums: Vec<u16>,
+    words: Vec<u32>,
 }
 
 impl Blocks {
@@ -69,11 +75,22 @@ impl Blocks {
             plane.clear();
             plane.reserve(self.columns * self.rows);
         }
+        self.steps.clear();
         for block_row in 0..self.rows {
+            // Here, since the row is at hand.
+            let row = frame.row(block_row * self.size);
+            let samples = self.samples.iter().skip(self.steps.len() * NOISE_STEP).step_by(NOISE_STEP);
+            let samples = samples.take_while(|s| s.row as usize == block_row);
+            self.steps.extend(samples.map(|s| {
+                let at = s.column as usize * self.size * channels;
+                row[at].abs_diff(*row.get(at + channels).unwrap_or(&row[at]))
+            }));
             let rows = block_row * self.size..height.min((block_row + 1) * self.size);
             // The usual blocks are summed several at a time; what is left of the row goes the common way.
             let done = match (&mut self.planes[..], self.size, rows.len()) {
-                ([plane], 4, 4) => widely!(sum_blocks([0, 1, 2, 3].map(|k| frame.row(rows.start + k)), plane)),
+                ([plane], 4, 4) => {
+                    widely!(sum_blocks([0, 1, 2, 3].map(|k| frame.row(rows.start + k)), &mut self.words, plane))
+                }
                 _ => 0,
             };
             if done == width {
@@ -102,21 +119,35 @@ impl Blocks {
     }
 }
 
-/// Appends the means of the blocks of 4 x 4 pixels of four rows; gives the number of columns done.
+/// Appends the means of the blocks of 4 x 4 pixels of four rows; gives the number of columns done. Rows are read one after the other, as they lie in
+/// memory.
 #[inline(always)]
-fn sum_blocks(rows: [&[u8]; 4], means: &mut Vec<f32>) -> usize {
+fn sum_blocks(rows: [&[u8]; 4], sums: &mut Vec<u32>, means: &mut Vec<f32>) -> usize {
     /// Every other byte of a word.
     const BYTES: u32 = 0x00ff_00ff;
-    let [a, b, c, d] = rows.map(|row| row.as_chunks::<4>().0);
-    let words = a.iter().zip(b).zip(c).zip(d).map(|(((a, b), c), d)| [a, b, c, d].map(|p| u32::from_le_bytes(*p)));
-    let from = means.len();
-    means.resize(from + a.len(), 0.0);
-    for (mean, words) in means[from..].iter_mut().zip(words) {
-        // Sums side by side in one word, of the even and the odd pixels. None outgrows its sixteen bits.
-        let pairs = words.iter().fold(0, |sum, w| sum + (w & BYTES) + (w >> 8 & BYTES));
-        *mean = ((pairs & 0xffff) + (pairs >> 16)) as i32 as f32 / 16.0;
+    // Sums side by side in one word, of the even and the odd pixels. None outgrows its sixteen bits.
+    let pairs = |word: [u8; 4]| {
+        let word = u32::from_le_bytes(word);
+        (word & BYTES) + (word >> 8 & BYTES)
+    };
+    let [first, middle @ .., last] = rows.map(|row| row.as_chunks::<4>().0);
+    sums.clear();
+    sums.resize(first.len(), 0);
+    for (sum, word) in sums.iter_mut().zip(first) {
+        *sum = pairs(*word);
     }
-    a.len() * 4
+    for row in middle {
+        for (sum, word) in sums.iter_mut().zip(row) {
+            *sum += pairs(*word);
+        }
+    }
+    let from = means.len();
+    means.resize(from + last.len(), 0.0);
+    for ((mean, sum), word) in means[from..].iter_mut().zip(&*sums).zip(last) {
+        let sum = sum + pairs(*word);
+        *mean = ((sum & 0xffff) + (sum >> 16)) as i32 as f32 / 16.0;
+    }
+    last.len() * 4
 }
 
 /// Side of a block in pixels: small pictures have small shapes.

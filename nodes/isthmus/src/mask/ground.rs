@@ -7,9 +7,8 @@
 //! brightness, hardly in hue. Where the light varies by more than shapes and ground differ, no threshold tells the two apart; then the ground is
 //! sought along the frame's rim.
 
-use super::blocks::{Blocks, Sample};
+use super::blocks::{Blocks, NOISE_STEP, Sample};
 use super::clipping::Clipping;
-use super::frame::Frame;
 use super::metric::Metric;
 use super::statistics::{NORMAL_MAD, median, otsu};
 use super::surface::{AlongRow, Surface};
@@ -111,10 +110,12 @@ impl GroundRow<'_> {
             }
             return;
         }
-        for (channel, levels) in self.levels[..self.channels].iter().enumerate() {
+        for (i, (difference, value)) in differences.iter_mut().zip(values(0)).enumerate() {
+            *difference = (value - self.levels[0].at(i)).abs();
+        }
+        for (channel, levels) in self.levels[..self.channels].iter().enumerate().skip(1) {
             for (i, (difference, value)) in differences.iter_mut().zip(values(channel)).enumerate() {
-                let own = (value - levels.at(i)).abs();
-                *difference = if channel == 0 { own } else { difference.max(own) };
+                *difference = difference.max((value - levels.at(i)).abs());
             }
         }
     }
@@ -226,12 +227,12 @@ fn rim_blocks(blocks: &Blocks) -> impl Iterator<Item = usize> {
 
 /// Finds the ground that a class of blocks belongs to, or, where nothing stands out from that clearly, the rim; `residual` is memory to be
 /// used again.
-pub(super) fn find(frame: &Frame<'_>, blocks: &Blocks, candidate: Candidate, residual: Vec<f32>) -> Ground {
-    let ground = fit(frame, blocks, candidate, residual);
+pub(super) fn find(blocks: &Blocks, candidate: Candidate, residual: Vec<f32>) -> Ground {
+    let ground = fit(blocks, candidate, residual);
     if ground.clarity >= CLEAR {
         return ground;
     }
-    let rim = fit(frame, blocks, along_rim(blocks), Vec::new());
+    let rim = fit(blocks, along_rim(blocks), Vec::new());
     if rim.clarity > ground.clarity { rim } else { ground }
 }
 
@@ -244,7 +245,7 @@ fn along_rim(blocks: &Blocks) -> Candidate {
 }
 
 /// Fits the ground to a class of blocks, and finds what stands out from it; `residual` is memory to be used again.
-fn fit(frame: &Frame<'_>, blocks: &Blocks, candidate: Candidate, residual: Vec<f32>) -> Ground {
+fn fit(blocks: &Blocks, candidate: Candidate, residual: Vec<f32>) -> Ground {
     let Candidate { mut is_ground } = candidate;
     let mut ground = Ground::default();
     let as_is = |mean| mean;
@@ -279,7 +280,7 @@ fn fit(frame: &Frame<'_>, blocks: &Blocks, candidate: Candidate, residual: Vec<f
             break;
         }
     }
-    ground.clipping = clipping(frame, blocks, &is_ground);
+    ground.clipping = clipping(blocks, &is_ground);
     let fit = |level: &dyn Fn(f32) -> f32| {
         blocks.sampled.iter().map(|sampled| fit_surface(blocks, sampled, &is_ground, LEVEL_SAMPLES, level)).collect()
     };
@@ -331,28 +332,24 @@ fn fill_sampled(blocks: &Blocks, ground: &Ground, residuals: &mut [f32]) {
 }
 
 /// What noise does to the levels of a frame, if it reaches beyond black or white anywhere.
-fn clipping(frame: &Frame<'_>, blocks: &Blocks, is_ground: &[bool]) -> Option<Clipping> {
-    let levels = blocks.sampled.iter().flatten();
-    let range = levels.fold([f32::MAX, f32::MIN], |[low, high], &level| {
-        [if level < low { level } else { low }, if level > high { level } else { high }]
-    });
-    Clipping::of(noise(frame, blocks, is_ground), range)
+fn clipping(blocks: &Blocks, is_ground: &[bool]) -> Option<Clipping> {
+    let [low, high] = widely!(blocks.sampled.iter().fold([u32::MAX, 0], |range, levels| bits_range(levels, range)));
+    let range = [low, high].map(f32::from_bits);
+    Clipping::of(noise(blocks, is_ground), range)
+}
+
+/// The range of some bits, and of those of levels, which are whole numbers in the same order: none is negative.
+#[inline(always)]
+fn bits_range(levels: &[f32], range: [u32; 2]) -> [u32; 2] {
+    levels.iter().map(|level| level.to_bits()).fold(range, |[low, high], bits| [low.min(bits), high.max(bits)])
 }
 
 /// Standard deviation of the grey levels of a frame's ground, from differences of neighbouring pixels.
-fn noise(frame: &Frame<'_>, blocks: &Blocks, is_ground: &[bool]) -> f32 {
+fn noise(blocks: &Blocks, is_ground: &[bool]) -> f32 {
     /// Median of the absolute difference of two normal numbers, in standard deviations.
     const MEDIAN: f32 = 0.953_9;
-    let channels = frame.format.channels();
-    let chosen = blocks.samples.iter().zip(is_ground).filter(|(_, is_ground)| **is_ground).map(|(s, _)| s);
-    let chosen = chosen.step_by(SCATTER_STEP);
-    let difference = |s: &Sample| {
-        let row = frame.row((s.row as usize * blocks.size).min(frame.height - 1));
-        let at = s.column as usize * blocks.size * channels;
-        let next = row.get(at + channels).unwrap_or(&row[at]);
-        f32::from(row[at].abs_diff(*next))
-    };
-    median(&chosen.map(difference).collect::<Vec<_>>()) / MEDIAN
+    let of_ground = blocks.steps.iter().zip(is_ground.iter().step_by(NOISE_STEP)).filter(|(_, is_ground)| **is_ground);
+    median(&of_ground.map(|(step, _)| f32::from(*step)).collect::<Vec<_>>()) / MEDIAN
 }
 
 /// Fits a surface to the ground's blocks, or to so many of them, about; `level` gives the level that a mean stands for.

@@ -4,7 +4,7 @@ use super::frame::Frame;
 use super::ground::Ground;
 use super::runs::Component;
 use super::standing::{MAX_DEPTH, Standing};
-use super::statistics::{median, quantile};
+use super::statistics::{median, quantile, quantiles};
 use super::surface::{AlongRow, Surface};
 use crate::wide::widely;
 
@@ -461,7 +461,7 @@ pub(super) struct RowSource<'a> {
 fn is_uniform(levels: &[f32], contrast: f32, scatter: f32) -> bool {
     /// Distance between the quartiles of a normal distribution, in standard deviations.
     const QUARTILES: f32 = 1.349;
-    let spread = quantile(levels, 0.75) - quantile(levels, 0.25);
-    let excess = (spread.powi(2) - (QUARTILES * scatter).powi(2)).max(0.0).sqrt();
+    let [lower, upper] = quantiles(levels, [0.25, 0.75]);
+    let excess = ((upper - lower).powi(2) - (QUARTILES * scatter).powi(2)).max(0.0).sqrt();
     excess <= UNIFORM * contrast
 }

@@ -2,7 +2,7 @@
 
 use super::blocks::Blocks;
 use super::ground::Ground;
-use super::runs::Components;
+use super::runs::{Components, Run};
 use std::ops::Range;
 
 /// Owner of the blocks that belong to no component.
@@ -10,24 +10,36 @@ pub(super) const NOBODY: u32 = u32::MAX;
 /// Greatest depth that is told apart, in blocks: beyond the blur of any edge worth measuring.
 pub(super) const MAX_DEPTH: u8 = 7;
 
-/// Makes every coarse component own its blocks and the free ones next to them.
+/// Makes every coarse component own its blocks and the free ones next to them; before, nobody owns any.
 pub(super) fn claim(blocks: &Blocks, coarse: &Components, owner: &mut Vec<u32>) {
-    let (columns, rows) = (blocks.columns, blocks.rows);
-    owner.clear();
-    owner.resize(columns * rows, NOBODY);
+    let columns = blocks.columns;
+    owner.resize(columns * blocks.rows, NOBODY);
     for run in &coarse.runs {
         let label = run.label as u32;
         owner[run.row * columns + run.start..run.row * columns + run.end].fill(label);
     }
     for run in &coarse.runs {
         let label = run.label as u32;
-        for row in run.row.saturating_sub(1)..rows.min(run.row + 2) {
-            let (start, end) = (run.start.saturating_sub(1), columns.min(run.end + 1));
-            for owner in &mut owner[row * columns + start..row * columns + end] {
+        for part in around(blocks, run) {
+            for owner in &mut owner[part] {
                 *owner = if *owner == NOBODY { label } else { *owner };
             }
         }
     }
+}
+
+/// Takes back what [`claim`] gave: less than all blocks, as a rule.
+pub(super) fn release(blocks: &Blocks, coarse: &Components, owner: &mut [u32]) {
+    for run in &coarse.runs {
+        around(blocks, run).for_each(|part| owner[part].fill(NOBODY));
+    }
+}
+
+/// The blocks of a run and those next to them, row by row.
+fn around(blocks: &Blocks, run: &Run) -> impl Iterator<Item = Range<usize>> + use<> {
+    let columns = blocks.columns;
+    let (start, end) = (run.start.saturating_sub(1), columns.min(run.end + 1));
+    (run.row.saturating_sub(1)..blocks.rows.min(run.row + 2)).map(move |row| row * columns + start..row * columns + end)
 }
 
 /// Blocks that stand out from a ground, joined to components.

@@ -28,7 +28,7 @@ pub(super) fn otsu(values: &[f32]) -> Split {
     for (v, n) in histogram.iter().enumerate() {
         below += f64::from(*n);
         below_sum += v as f64 * f64::from(*n);
-        if below == 0.0 || below == total {
+        if *n == 0 || below == total {
             continue;
         }
         let (low, high) = (below_sum / below, (sum - below_sum) / (total - below));
@@ -51,12 +51,24 @@ pub(super) fn median(values: &[f32]) -> f32 {
 
 /// Quantile of a list; 0 of an empty one.
 pub(super) fn quantile(values: &[f32], q: f64) -> f32 {
-    if values.is_empty() {
-        return 0.0;
-    }
-    let k = ((values.len() - 1) as f64 * q) as usize;
+    let [quantile] = quantiles(values, [q]);
+    quantile
+}
+
+/// Some quantiles of a list, from low to high.
+pub(super) fn quantiles<const N: usize>(values: &[f32], parts: [f64; N]) -> [f32; N] {
     // The bits of floating point numbers, those but the sign of negative ones turned round, are whole numbers in the same order, and quicker to sort.
     let turned = |bits: i32| bits ^ ((bits >> 31) & i32::MAX);
     let mut keys: Vec<i32> = values.iter().map(|v| turned(v.to_bits() as i32)).collect();
-    f32::from_bits(turned(*keys.select_nth_unstable(k).1) as u32)
+    let mut from = 0;
+    parts.map(|q| {
+        if values.is_empty() {
+            return 0.0;
+        }
+        let k = ((values.len() - 1) as f64 * q) as usize;
+        let key = *keys[from..].select_nth_unstable(k - from).1;
+        // What follows is no less.
+        from = k;
+        f32::from_bits(turned(key) as u32)
+    })
 }

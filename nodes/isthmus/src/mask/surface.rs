@@ -22,24 +22,39 @@ impl Surface {
     /// far from the first fit (specks, shadows): beyond three deviations.
     pub(super) fn fit(size: [usize; 2], levels: impl Iterator<Item = ([f64; 2], f32)>) -> Self {
         let scale = size.map(|n| 2.0 / (n.max(2) - 1) as f64);
-        let samples: Vec<([f64; 2], f32)> = levels.collect();
+        let samples: Vec<([f64; 2], f64)> =
+            levels.map(|(place, level)| (scaled(scale, place), f64::from(level))).collect();
         let mut sums = NormalEquations::default();
-        widely!(sums.add_all(&samples, scale));
+        widely!(sums.add_all(&samples));
         let first = Self { coefficients: sums.solve(), scale };
-        let residuals: Vec<f32> = samples.iter().map(|([x, y], level)| (level - first.at(*x, *y)).abs()).collect();
+        let mut residuals = vec![0.0; samples.len()];
+        widely!(first.fill_residuals(&samples, &mut residuals));
         let few = residuals.iter().step_by((residuals.len() / SPREAD_SAMPLES).max(1));
         let limit = (3.0 / NORMAL_MAD * median(&few.copied().collect::<Vec<_>>())).max(1.0);
         for ((place, level), _) in samples.iter().zip(&residuals).filter(|(_, residual)| **residual > limit) {
-            sums.add(scaled(scale, *place), f64::from(*level), -1.0);
+            sums.add(*place, *level, -1.0);
         }
         Self { coefficients: sums.solve(), scale }
     }
 
     /// Level at a block.
     pub(super) fn at(&self, column: f64, row: f64) -> f32 {
+        self.at_scaled(scaled(self.scale, [column, row])) as f32
+    }
+
+    /// Level at a place in the surface's own coordinates.
+    #[inline(always)]
+    fn at_scaled(&self, [u, v]: [f64; 2]) -> f64 {
         let c = &self.coefficients;
-        let [u, v] = scaled(self.scale, [column, row]);
-        (c[0] + v * (c[2] + v * c[5]) + u * (c[1] + v * c[4] + u * c[3])) as f32
+        c[0] + v * (c[2] + v * c[5]) + u * (c[1] + v * c[4] + u * c[3])
+    }
+
+    /// By how much samples lie off the surface.
+    #[inline(always)]
+    fn fill_residuals(&self, samples: &[([f64; 2], f64)], residuals: &mut [f32]) {
+        for (residual, (place, level)) in residuals.iter_mut().zip(samples) {
+            *residual = (level - self.at_scaled(*place)).abs() as f32;
+        }
     }
 
     /// The levels along a row, from a column in steps.
@@ -86,9 +101,9 @@ struct NormalEquations {
 impl NormalEquations {
     /// Adds samples.
     #[inline(always)]
-    fn add_all(&mut self, samples: &[([f64; 2], f32)], scale: [f64; 2]) {
+    fn add_all(&mut self, samples: &[([f64; 2], f64)]) {
         for (place, level) in samples {
-            self.add(scaled(scale, *place), f64::from(*level), 1.0);
+            self.add(*place, *level, 1.0);
         }
     }
 
