@@ -23,7 +23,7 @@ pub mod isthmus;
 pub mod mask;
 pub mod profile;
 pub mod skeleton;
-mod wide;
+pub mod wide;
 
 use crate::skeleton::Polarity;
 

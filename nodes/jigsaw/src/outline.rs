@@ -7,6 +7,7 @@ use crate::Piece;
 use isthmus::isthmus::{Isthmus, Polarity};
 use isthmus::{Point, hull};
 use nalgebra::Vector2;
+use std::sync::LazyLock;
 
 /// Samples of an IDF in the shape index: enough for a tab (its finest feature is about a tenth of its path).
 pub(crate) const SHAPE_SAMPLES: usize = 64;
@@ -55,8 +56,8 @@ pub(crate) struct Segment {
     pub(crate) shape: [f32; SHAPE_SAMPLES],
     /// Leading cosine coefficients of `shape`: a root mean square distance between keys never exceeds that of shapes.
     pub(crate) keys: [f32; KEYS],
-    /// Points at equal parts of the path, relative to their `middle`, in the order in which a tab runs.
-    pub(crate) samples: [[f32; 2]; ROUGH_SAMPLES],
+    /// Points at equal parts of the path, relative to their `middle`, in the order in which a tab runs: along x, and along y.
+    pub(crate) samples: [[f32; ROUGH_SAMPLES]; 2],
     /// Middle of the samples, relative to the isthmus point.
     pub(crate) middle: [f32; 2],
     /// Border points of the extended segment in running order: every border point for a mouth, thinned for a tab.
@@ -288,7 +289,7 @@ impl Outline {
             arc: isthmus.arc[0],
             keys: keys(&shape),
             shape,
-            samples: points.map(|p| [(p.x - middle.x) as f32, (p.y - middle.y) as f32]),
+            samples: [points.map(|p| (p.x - middle.x) as f32), points.map(|p| (p.y - middle.y) as f32)],
             middle: [middle.x as f32, middle.y as f32],
             run,
             step: thin as f64 * self.spacing,
@@ -386,11 +387,14 @@ fn usable(isthmus: &Isthmus, length: f64) -> bool {
 
 /// Leading coefficients of the orthonormal cosine transform, scaled to root mean square.
 fn keys(shape: &[f32; SHAPE_SAMPLES]) -> [f32; KEYS] {
-    let n = SHAPE_SAMPLES as f32;
-    std::array::from_fn(|k| {
-        let w = std::f32::consts::PI * (k + 1) as f32 / n;
-        let sum: f32 = shape.iter().enumerate().map(|(i, v)| v * (w * (i as f32 + 0.5)).cos()).sum();
-        sum * (2.0f32).sqrt() / n
+    /// Cosines of the transform: 512 for each segment, were they computed each time.
+    static WAVES: LazyLock<[[f32; SHAPE_SAMPLES]; KEYS]> = LazyLock::new(|| {
+        let w = |k: usize| std::f32::consts::PI * (k + 1) as f32 / SHAPE_SAMPLES as f32;
+        std::array::from_fn(|k| std::array::from_fn(|i| (w(k) * (i as f32 + 0.5)).cos()))
+    });
+    WAVES.each_ref().map(|wave| {
+        let sum: f32 = shape.iter().zip(wave).map(|(v, cos)| v * cos).sum();
+        sum * (2.0f32).sqrt() / SHAPE_SAMPLES as f32
     })
 }
 
@@ -443,51 +447,44 @@ impl Raster {
         let rows = ((high.y - low.y) / cell + 2.0 * MARGIN) as usize + 1;
         let centre =
             |c: usize, r: usize| Point::new(origin.x + (c as f64 + 0.5) * cell, origin.y + (r as f64 + 0.5) * cell);
-        let mut nearest = vec![u32::MAX; columns * rows];
-        let mut square = vec![f64::INFINITY; columns * rows];
+        // A rim of cells that know no border point spares the sweeps a look at where the raster ends.
+        let width = columns + 2;
+        let place = |c: usize, r: usize| (r + 1) * width + c + 1;
+        let mut nearest = vec![u32::MAX; width * (rows + 2)];
+        let mut square = vec![f64::INFINITY; nearest.len()];
         for (i, p) in points.iter().enumerate() {
             let (c, r) = (((p.x - origin.x) / cell) as usize, ((p.y - origin.y) / cell) as usize);
-            let k = r.min(rows - 1) * columns + c.min(columns - 1);
+            let k = place(c.min(columns - 1), r.min(rows - 1));
             let d = (centre(c, r) - p).norm_squared();
             if d < square[k] {
                 (square[k], nearest[k]) = (d, i as u32);
             }
         }
-        let mut relax = |c: usize, r: usize, dc: i64, dr: i64| {
-            let (oc, or) = (c as i64 + dc, r as i64 + dr);
-            if oc < 0 || or < 0 || oc >= columns as i64 || or >= rows as i64 {
-                return;
-            }
-            let other = nearest[or as usize * columns + oc as usize];
-            if other == u32::MAX {
-                return;
-            }
-            let d = (centre(c, r) - points[other as usize]).norm_squared();
-            let k = r * columns + c;
-            if d < square[k] {
-                (square[k], nearest[k]) = (d, other);
+        let mut relax = |c: usize, r: usize, beside: &[usize]| {
+            let (k, p) = (place(c, r), centre(c, r));
+            for other in beside {
+                // What lies before is so many cells behind, once round.
+                let other = nearest[k.wrapping_add(*other)];
+                if other == u32::MAX || other == nearest[k] {
+                    continue;
+                }
+                let d = (p - points[other as usize]).norm_squared();
+                if d < square[k] {
+                    (square[k], nearest[k]) = (d, other);
+                }
             }
         };
+        let [left, above] = [1, width].map(usize::wrapping_neg);
         for r in 0..rows {
-            for c in 0..columns {
-                for (dc, dr) in [(-1, 0), (0, -1), (-1, -1), (1, -1)] {
-                    relax(c, r, dc, dr);
-                }
-            }
-            for c in (0..columns).rev() {
-                relax(c, r, 1, 0);
-            }
+            (0..columns).for_each(|c| relax(c, r, &[left, above, above.wrapping_add(left), above.wrapping_add(1)]));
+            (0..columns).rev().for_each(|c| relax(c, r, &[1]));
         }
         for r in (0..rows).rev() {
-            for c in (0..columns).rev() {
-                for (dc, dr) in [(1, 0), (0, 1), (1, 1), (-1, 1)] {
-                    relax(c, r, dc, dr);
-                }
-            }
-            for c in 0..columns {
-                relax(c, r, -1, 0);
-            }
+            (0..columns).rev().for_each(|c| relax(c, r, &[1, width, width + 1, width - 1]));
+            (0..columns).for_each(|c| relax(c, r, &[left]));
         }
+        let nearest: Vec<u32> =
+            nearest.chunks(width).skip(1).take(rows).flat_map(|row| &row[1..=columns]).copied().collect();
         // Which side a cell lies on is counted, not told from the nearest normal: beyond a corner that is ambiguous.
         let mut crossings: Vec<Vec<f64>> = vec![Vec::new(); rows];
         for (i, a) in points.iter().enumerate() {

@@ -15,7 +15,10 @@
 //! Complexity O(rounds · samples), 1 µs to 10 µs. Fails where the first pose is off by more than about half a neck,
 //! and slides where the borders are near-circular or straight: the clearance is clamped and damped.
 
+#![allow(clippy::needless_range_loop, reason = "a lane of many arrays side by side")]
+
 use crate::outline::{LEAST_WIDTH, Node, ROUGH_SAMPLES, Segment};
+use isthmus::wide::widely;
 use nalgebra::{Isometry2, Matrix3, Matrix4, Point2, Vector2, Vector3, Vector4};
 
 /// Limit of the fitted clearance in piece scales: no cut or segmentation takes more, and a free fit may diverge.
@@ -107,14 +110,7 @@ impl Pose {
 
 /// Best rigid pose of the samples of the two match segments, pair by pair (Umeyama 1991 without scale).
 fn first_pose(tab: &Segment, mouth: &Segment) -> Pose {
-    let (mut dots, mut crosses) = ([0f32; LANES], [0f32; LANES]);
-    for (a, b) in tab.samples.chunks_exact(LANES).zip(mouth.samples.chunks_exact(LANES)) {
-        for l in 0..LANES {
-            dots[l] += a[l][0] * b[l][0] + a[l][1] * b[l][1];
-            crosses[l] += a[l][0] * b[l][1] - a[l][1] * b[l][0];
-        }
-    }
-    let [dot, cross] = [dots, crosses].map(|lanes| f64::from(lanes.iter().sum::<f32>()));
+    let (dot, cross) = widely!(products(&tab.samples, &mouth.samples));
     let norm = dot.hypot(cross).max(f64::EPSILON);
     let (cos, sin) = (dot / norm, cross / norm);
     let [ax, ay] = tab.middle.map(f64::from);
@@ -122,22 +118,37 @@ fn first_pose(tab: &Segment, mouth: &Segment) -> Pose {
     Pose { cos, sin, x: bx - cos * ax + sin * ay, y: by - sin * ax - cos * ay }
 }
 
+/// Sums of dot and cross products of points.
+#[inline(always)]
+fn products([ax, ay]: &[[f32; ROUGH_SAMPLES]; 2], [bx, by]: &[[f32; ROUGH_SAMPLES]; 2]) -> (f64, f64) {
+    let (mut dots, mut crosses) = ([0f32; LANES], [0f32; LANES]);
+    for k in (0..ROUGH_SAMPLES).step_by(LANES) {
+        for l in 0..LANES {
+            dots[l] += ax[k + l] * bx[k + l] + ay[k + l] * by[k + l];
+            crosses[l] += ax[k + l] * by[k + l] - ay[k + l] * bx[k + l];
+        }
+    }
+    (f64::from(dots.iter().sum::<f32>()), f64::from(crosses.iter().sum::<f32>()))
+}
+
 /// Pose of the first segment's piece in the image of the second's in which their samples lie on one another best.
 pub(crate) fn laid_on(a: &Segment, b: &Segment) -> Isometry2<f64> {
     first_pose(a, b).between_images(a, b)
 }
 
-/// Points worked on side by side, so that the arithmetic fills vector registers.
-const LANES: usize = 4;
+/// Points worked on side by side, so that the arithmetic fills the vector registers of AVX2.
+const LANES: usize = 8;
 
 /// Some points of a tab with their feet on a mouth's border, in the mouth's frame but for `x` and `y`.
 #[derive(Debug, Clone, Copy, Default)]
-struct Quad {
+struct Group {
     /// The points in the tab's frame.
     x: [f32; LANES],
     y: [f32; LANES],
-    /// Places of their feet on the mouth's run, in steps.
+    /// Places of their feet on the mouth's run, in steps, and the nodes before them, with their places.
     at: [f32; LANES],
+    place: [f32; LANES],
+    before: Nodes,
     /// The points in the mouth's frame.
     px: [f32; LANES],
     py: [f32; LANES],
@@ -152,41 +163,72 @@ struct Quad {
     mask: [f32; LANES],
 }
 
-impl Quad {
+impl Group {
+    /// Finds the nodes before the feet.
+    #[inline(always)]
+    fn look_up(&mut self, run: &[Node]) {
+        let most = (run.len() - 2) as f32;
+        for l in 0..LANES {
+            self.place[l] = self.at[l].floor().min(most);
+        }
+        self.before = Nodes::of(run, &self.place);
+    }
+
     /// Moves the points and finds their feet near where they were: along the tangent, once. Rounds of refinement that
     /// follow one another take a foot to where it belongs (Newton's method, without a branch for each point).
+    #[inline(always)]
     fn find(&mut self, run: &[Node], step: f32, (cos, sin, x, y): (f32, f32, f32, f32)) {
         // Numbers of 32 bits are rounded side by side.
-        let most = run.len() as i32 - 2;
-        let last = (most + 1) as f32;
+        let last = (run.len() - 1) as f32;
         let half_spacing = 0.5 / step;
+        let mut moved = [0.0; LANES];
         for l in 0..LANES {
             self.px[l] = cos * self.x[l] - sin * self.y[l] + x;
             self.py[l] = sin * self.x[l] + cos * self.y[l] + y;
-        }
-        let place = self.at.map(|at| (at as i32).min(most));
-        let node = place.map(|i| run[i as usize]);
-        let mut moved = [0.0; LANES];
-        for l in 0..LANES {
             // Outward normals stand to the right of the running direction in an image, whose y points down.
-            let along = (self.py[l] - node[l].y) * node[l].nx - (self.px[l] - node[l].x) * node[l].ny;
-            moved[l] = place[l] as f32 + (along * step).clamp(-STRIDE, STRIDE);
+            let a = &self.before;
+            let along = (self.py[l] - a.y[l]) * a.nx[l] - (self.px[l] - a.x[l]) * a.ny[l];
+            moved[l] = self.place[l] + (along * step).clamp(-STRIDE, STRIDE);
             self.at[l] = moved[l].clamp(0.0, last);
         }
-        let place = self.at.map(|at| (at as i32).min(most));
-        let (here, next) = (place.map(|i| run[i as usize]), place.map(|i| run[i as usize + 1]));
+        self.look_up(run);
+        let (a, b) = (&self.before, Nodes::of(&run[1..], &self.place));
         for l in 0..LANES {
-            let part = self.at[l] - place[l] as f32;
+            let part = self.at[l] - self.place[l];
             let lerp = |p: f32, q: f32| p + (q - p) * part;
-            let (a, b) = (&here[l], &next[l]);
-            self.nx[l] = lerp(a.nx, b.nx);
-            self.ny[l] = lerp(a.ny, b.ny);
+            self.nx[l] = lerp(a.nx[l], b.nx[l]);
+            self.ny[l] = lerp(a.ny[l], b.ny[l]);
             // Between two nodes lies an arc, which rises over the chord where the normals diverge.
-            let bulge = half_spacing * part * (1.0 - part) * (a.nx * b.ny - a.ny * b.nx);
-            self.distance[l] =
-                (self.px[l] - lerp(a.x, b.x)) * self.nx[l] + (self.py[l] - lerp(a.y, b.y)) * self.ny[l] - bulge;
+            let bulge = half_spacing * part * (1.0 - part) * (a.nx[l] * b.ny[l] - a.ny[l] * b.nx[l]);
+            let (dx, dy) = (self.px[l] - lerp(a.x[l], b.x[l]), self.py[l] - lerp(a.y[l], b.y[l]));
+            self.distance[l] = dx * self.nx[l] + dy * self.ny[l] - bulge;
             self.mask[l] = if moved[l] == self.at[l] { self.present[l] } else { 0.0 };
         }
+    }
+}
+
+/// Some nodes of a run side by side.
+#[derive(Debug, Clone, Copy, Default)]
+struct Nodes {
+    x: [f32; LANES],
+    y: [f32; LANES],
+    nx: [f32; LANES],
+    ny: [f32; LANES],
+}
+
+impl Nodes {
+    /// The nodes at some places, which are whole numbers.
+    #[inline(always)]
+    fn of(run: &[Node], places: &[f32; LANES]) -> Self {
+        /// Added to a whole number that is less, it leaves that in the lowest bits of the sum: unlike a cast, which has to mind
+        /// what is no such number, in one instruction for all lanes.
+        const SHIFT: f32 = 8_388_608.0;
+        let mut nodes = Self::default();
+        for l in 0..LANES {
+            let node = &run[((places[l] + SHIFT).to_bits() - SHIFT.to_bits()) as usize];
+            (nodes.x[l], nodes.y[l], nodes.nx[l], nodes.ny[l]) = (node.x, node.y, node.nx, node.ny);
+        }
+        nodes
     }
 }
 
@@ -194,27 +236,29 @@ impl Quad {
 /// of them.
 #[derive(Debug, Default)]
 pub(crate) struct Feet {
-    quads: Vec<Quad>,
+    groups: Vec<Group>,
     /// Which points lie on the match segment proper.
     core: std::ops::Range<usize>,
-    off: Vec<f32>,
+    /// Bits of residuals.
+    off: Vec<[i32; LANES]>,
 }
 
 impl Feet {
     /// Takes points and the places at which to look first for their feet.
     fn start(&mut self, points: impl Iterator<Item = (f32, f32, f64)>, mouth: &Segment) {
         let last = mouth.run.len().saturating_sub(1) as f64;
-        self.quads.clear();
+        self.groups.clear();
         for (k, (x, y, place)) in points.enumerate() {
             if k % LANES == 0 {
-                self.quads.push(Quad::default());
+                self.groups.push(Group::default());
             }
-            if let Some(quad) = self.quads.last_mut() {
+            if let Some(group) = self.groups.last_mut() {
                 let l = k % LANES;
-                (quad.x[l], quad.y[l], quad.at[l]) = (x, y, place.clamp(0.0, last) as f32);
-                quad.present[l] = 1.0;
+                (group.x[l], group.y[l], group.at[l]) = (x, y, place.clamp(0.0, last) as f32);
+                group.present[l] = 1.0;
             }
         }
+        widely!(self.groups.iter_mut().for_each(|group| group.look_up(&mouth.run)));
     }
 
     /// Starts with the samples of the match segment: they lie at equal parts of both.
@@ -222,7 +266,9 @@ impl Feet {
         let core = (mouth.core.len() - 1) as f64 / (ROUGH_SAMPLES - 1) as f64;
         let place = |k: usize| mouth.core.end as f64 - 1.0 - k as f64 * core;
         let [x, y] = tab.middle;
-        self.start(tab.samples.iter().enumerate().map(|(k, s)| (s[0] + x, s[1] + y, place(k))), mouth);
+        let [xs, ys] = &tab.samples;
+        let samples = xs.iter().zip(ys).enumerate();
+        self.start(samples.map(|(k, (px, py))| (px + x, py + y, place(k))), mouth);
         self.core = 0..ROUGH_SAMPLES;
     }
 
@@ -239,9 +285,7 @@ impl Feet {
     fn find(&mut self, mouth: &Segment, pose: &Pose) {
         let pose = (pose.cos as f32, pose.sin as f32, pose.x as f32, pose.y as f32);
         let step = (1.0 / mouth.step) as f32;
-        for quad in &mut self.quads {
-            quad.find(&mouth.run, step, pose);
-        }
+        widely!(self.groups.iter_mut().for_each(|group| group.find(&mouth.run, step, pose)));
     }
 
     /// Brings feet that were only guessed to where they belong.
@@ -251,59 +295,71 @@ impl Feet {
         }
     }
 
-    /// Distances of the points that have feet, of some of the points.
-    fn distances(&self, points: std::ops::Range<usize>) -> impl Iterator<Item = f32> {
-        let quads = self.quads.iter().enumerate().take(points.end.div_ceil(LANES)).skip(points.start / LANES);
-        quads.flat_map(move |(k, quad)| {
-            let points = points.clone();
-            (0..LANES)
-                .filter(move |l| quad.mask[*l] > 0.0 && points.contains(&(k * LANES + l)))
-                .map(move |l| quad.distance[l])
-        })
-    }
-
     fn points(&self) -> std::ops::Range<usize> {
-        0..self.quads.len() * LANES
+        0..self.groups.len() * LANES
     }
 
     /// How many points have a foot.
     fn rows(&self) -> usize {
-        self.quads.iter().map(|q| q.mask.iter().sum::<f32>() as usize).sum()
+        self.groups.iter().map(|q| q.mask.iter().sum::<f32>() as usize).sum()
     }
 
-    /// Mean capped residual of some of the points.
-    fn residual(&self, points: std::ops::Range<usize>, clearance: f64, cap: f64) -> f64 {
+    /// Over some of the points: the mean capped residual, and the sums of what overlaps and of what gapes.
+    #[inline(always)]
+    fn gaps(&self, points: &std::ops::Range<usize>, clearance: f64, cap: f64) -> [f64; 3] {
         let (clearance, cap) = (clearance as f32, cap as f32);
-        let (mut sum, mut count) = (0.0, 0);
-        for d in self.distances(points) {
-            sum += f64::from((d - clearance).abs().min(cap));
-            count += 1;
-        }
-        sum / f64::from(count.max(1))
-    }
-
-    /// Median residual.
-    fn spread(&mut self, clearance: f64) -> f64 {
-        let clearance = clearance as f32;
-        self.off.clear();
-        for quad in &self.quads {
+        let mut sums = [[0f64; LANES]; 4];
+        let groups = self.groups.iter().enumerate().take(points.end.div_ceil(LANES)).skip(points.start / LANES);
+        for (k, group) in groups {
             for l in 0..LANES {
-                if quad.mask[l] > 0.0 {
-                    self.off.push((quad.distance[l] - clearance).abs());
-                }
+                let here = if points.contains(&(k * LANES + l)) { group.mask[l] } else { 0.0 };
+                let distance = group.distance[l];
+                sums[0][l] += f64::from(here * (distance - clearance).abs().min(cap));
+                sums[1][l] += f64::from(here * (-distance).max(0.0));
+                sums[2][l] += f64::from(here * distance.max(0.0));
+                sums[3][l] += f64::from(here);
             }
         }
-        if self.off.is_empty() {
-            return 0.0;
+        let [residual, overlap, gap, count] = sums.map(|lanes| lanes.iter().sum::<f64>());
+        [residual / count.max(1.0), overlap, gap]
+    }
+
+    /// Median residual, bit by bit: the greatest number than which no more than half of them are less. Numbers that aren't
+    /// negative are ordered as their bits are.
+    #[inline(always)]
+    fn spread(&mut self, clearance: f64) -> f64 {
+        let clearance = clearance as f32;
+        let middle = (self.rows() / 2) as i32;
+        self.off.clear();
+        for group in &self.groups {
+            let mut off = [i32::MAX; LANES];
+            for l in 0..LANES {
+                if group.mask[l] > 0.0 {
+                    off[l] = (group.distance[l] - clearance).abs().to_bits() as i32;
+                }
+            }
+            self.off.push(off);
         }
-        let middle = self.off.len() / 2;
-        f64::from(*self.off.select_nth_unstable_by(middle, f32::total_cmp).1)
+        let mut median = 0;
+        for bit in (0..31).rev() {
+            let larger = median | 1 << bit;
+            let mut less = [0; LANES];
+            for off in &self.off {
+                for l in 0..LANES {
+                    less[l] += i32::from(off[l] < larger);
+                }
+            }
+            if less.iter().sum::<i32>() <= middle {
+                median = larger;
+            }
+        }
+        f64::from(f32::from_bits(median as u32))
     }
 
     /// What the contact tells about the pose: the normal matrix without the clearance (Schur complement).
     fn information(&mut self, clearance: f64, limit: f64, free: bool) -> Matrix3<f64> {
-        let width = weight_width(self.spread(clearance), limit);
-        let (h, ..) = self.normal_equations(clearance, width);
+        let width = weight_width(widely!(self.spread(clearance)), limit);
+        let (h, ..) = widely!(self.normal_equations(clearance, width));
         let block = h.fixed_view::<3, 3>(0, 0).into_owned();
         let column: Vector3<f64> = h.fixed_view::<3, 1>(0, 3).into_owned();
         if free && h[(3, 3)] > f64::EPSILON { block - column * column.transpose() / h[(3, 3)] } else { block }
@@ -311,14 +367,14 @@ impl Feet {
 
     /// Weighted normal equations over (x, y, turn, clearance) about the local origin: matrix, right side, sum of
     /// weights.
-    #[allow(clippy::needless_range_loop, reason = "a lane of many arrays side by side")]
+    #[inline(always)]
     fn normal_equations(&self, clearance: f64, width: f64) -> (Matrix4<f64>, Vector4<f64>, f64) {
         /// Different products that are summed: ten of the symmetric matrix, the last of which is the sum of weights,
         /// and four of the right side.
         const SUMS: usize = 14;
         let (clearance, inverse) = (clearance as f32, 1.0 / width.max(f64::EPSILON) as f32);
         let mut sums = [[0f32; LANES]; SUMS];
-        for q in &self.quads {
+        for q in &self.groups {
             for l in 0..LANES {
                 let (nx, ny) = (q.nx[l], q.ny[l]);
                 let r = q.distance[l] - clearance;
@@ -361,8 +417,8 @@ fn weight_width(spread: f64, limit: f64) -> f64 {
 
 /// One step of weighted least squares.
 fn step(feet: &mut Feet, pose: &mut Pose, clearance: &mut f64, free: bool, limit: f64) {
-    let width = weight_width(feet.spread(*clearance), limit);
-    let (mut h, mut g, total) = feet.normal_equations(*clearance, width);
+    let width = weight_width(widely!(feet.spread(*clearance)), limit);
+    let (mut h, mut g, total) = widely!(feet.normal_equations(*clearance, width));
     if total < 4.0 {
         return;
     }
@@ -413,7 +469,8 @@ pub(crate) fn rough(tab: &Segment, mouth: &Segment, scale: f64, free: bool, feet
     if feet.rows() < ROUGH_SAMPLES / 2 {
         return None;
     }
-    Some(Rough { pose, clearance, residual: feet.residual(feet.points(), clearance, RESIDUAL_CAP * scale) })
+    let [residual, ..] = widely!(feet.gaps(&feet.points(), clearance, RESIDUAL_CAP * scale));
+    Some(Rough { pose, clearance, residual })
 }
 
 /// Refines a rough pose on a part of the nodes of the extended match segment: enough to tell which candidates are worth
@@ -452,6 +509,9 @@ fn fit(
     (rounds, stride): (usize, usize),
     feet: &mut Feet,
 ) -> Option<Fit> {
+    if mouth.run.len() < 2 {
+        return None;
+    }
     let limit = MAX_CLEARANCE * scale;
     feet.start_with_nodes(tab, mouth, stride);
     feet.settle(mouth, &pose);
@@ -464,14 +524,10 @@ fn fit(
         return None;
     }
     let cap = RESIDUAL_CAP * scale;
-    let residual = feet.residual(feet.points(), clearance, cap);
+    let [residual, ..] = widely!(feet.gaps(&feet.points(), clearance, cap));
     let information = feet.information(clearance, limit, free) * stride as f64;
-    let (mut pos_gap, mut neg_gap) = (0.0, 0.0);
-    for distance in feet.distances(feet.core.clone()) {
-        let area = f64::from(distance) * tab.step * stride as f64;
-        if area < 0.0 { pos_gap -= area } else { neg_gap += area }
-    }
-    let ave_gap = feet.residual(feet.core.clone(), clearance, cap);
+    let [ave_gap, overlap, gap] = widely!(feet.gaps(&feet.core, clearance, cap));
+    let [pos_gap, neg_gap] = [overlap, gap].map(|sum| sum * tab.step * stride as f64);
     let negative_from_positive = pose.between_images(tab, mouth);
     Some(Fit { negative_from_positive, clearance, residual, ave_gap, pos_gap, neg_gap, information })
 }
