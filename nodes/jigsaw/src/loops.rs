@@ -22,7 +22,9 @@ use crate::placement::laid_on;
 use crate::posegraph::{lever, turned};
 use crate::slots::{Slot, Slots};
 use isthmus::Point;
+use isthmus::wide::widely;
 use nalgebra::{Isometry2, Matrix3, Vector2, Vector3};
+use rayon::prelude::*;
 
 /// A candidate mating as the assembly sees it: pieces are ranks by id.
 #[derive(Debug, Clone, PartialEq)]
@@ -212,7 +214,9 @@ impl<'a> Ways<'a> {
         (outlines, slots): (&'a [&'a Outline], &'a Slots<'a>),
         tolerance: Tolerance,
     ) -> Self {
-        let mut steps: Vec<Vec<Way>> = vec![Vec::new(); outlines.len()];
+        let mut counts = vec![0; outlines.len()];
+        active.iter().flat_map(|k| [edges[*k].a, edges[*k].b]).for_each(|piece| counts[piece] += 1);
+        let mut steps: Vec<Vec<Way>> = counts.into_iter().map(Vec::with_capacity).collect();
         for &k in active {
             let e = &edges[k];
             let way = |to, pose| Way { to, via: None, pose, edges: [k, k] };
@@ -225,7 +229,6 @@ impl<'a> Ways<'a> {
     /// All loops that close within the tolerance, and what would close if the piece on each way of two steps were another
     /// one. Of large puzzles only a part of the decoys is tried.
     pub(crate) fn close(&self) -> (Vec<Loop>, Decoys) {
-        use rayon::prelude::*;
         /// Sets of decoys at most: a few pieces have too few ways to show what chance does.
         const SETS: u64 = 3;
         /// Ways tried at most, about: more don't make chance better known.
@@ -236,11 +239,11 @@ impl<'a> Ways<'a> {
         let ways: usize = self.steps.iter().map(|s| s.len() * s.len()).sum::<usize>() / 2;
         let share = (TRIES / (SETS * ways.max(1) as u64) as f64).min(1.0);
         let tried = |a: usize| (share * (a + 1) as f64).floor() > (share * a as f64).floor();
-        let from = |a: usize| {
-            let ways = self.from(a);
+        let from = |leading: &mut Vec<u32>, a: usize| {
+            let ways = self.from(a, leading);
             (self.close_at(a, &ways), tried(a).then(|| self.decoys_at(a, &ways, &doors, SETS)))
         };
-        let found: Vec<(Vec<Loop>, Option<Decoys>)> = (0..n).into_par_iter().map(from).collect();
+        let found: Vec<(Vec<Loop>, Option<Decoys>)> = (0..n).into_par_iter().map_init(|| vec![0; n], from).collect();
         let sets = SETS as f64 * (0..n).filter(|a| tried(*a)).count() as f64 / n.max(1) as f64;
         let mut all = (Vec::new(), Decoys { sets, ..Decoys::default() });
         for (loops, decoys) in found {
@@ -254,27 +257,32 @@ impl<'a> Ways<'a> {
     }
 
     /// Ways of one and two steps from `a` to pieces of higher rank to which others lead as well, ordered by the piece and by
-    /// where they lead: compared in this order, what is near stays near.
-    fn from(&self, a: usize) -> Vec<(Place, Way)> {
-        let mut long: Vec<(usize, &Way, Option<&Way>)> = Vec::new();
-        for first in self.steps[a].iter().filter(|w| w.to > a) {
+    /// where they lead: compared in this order, what is near stays near. `leading` counts the ways to each piece; it is all
+    /// zeros before and after.
+    fn from(&self, a: usize, leading: &mut [u32]) -> Vec<(Place, Way)> {
+        let steps = self.steps[a].iter().filter(|w| w.to > a);
+        let mut long: Vec<(usize, &Way, Option<&Way>)> =
+            Vec::with_capacity(steps.clone().map(|w| 1 + self.steps[w.to].len()).sum());
+        for first in steps {
             long.push((first.to, first, None));
             let arrives = self.arrives(first);
             let onwards = self.steps[first.to].iter().filter(|w| w.to > a && w.to != first.to);
             let free = onwards.filter(|second| !self.slots.conflict(arrives, self.leaves(first.to, second)));
             long.extend(free.map(|second| (second.to, first, Some(second))));
         }
-        long.sort_unstable_by_key(|(to, ..)| *to);
-        let mut ways = Vec::new();
+        long.iter().for_each(|(to, ..)| leading[*to] += 1);
         // Most lead where no other does, and are not worth more than that.
-        for group in long.chunk_by(|p, q| p.0 == q.0).filter(|g| g.len() > 1) {
-            let begin = ways.len();
-            ways.extend(group.iter().map(|(_, first, second)| {
-                let way = second.map_or(**first, |second| first.then(second));
-                (self.place(&way), way)
-            }));
-            ways[begin..].sort_unstable_by(|(p, v), (q, w)| p.x.total_cmp(&q.x).then_with(|| v.edges.cmp(&w.edges)));
-        }
+        long.retain(|(to, ..)| leading[*to] > 1 || std::mem::take(&mut leading[*to]) > 1);
+        long.iter().for_each(|(to, ..)| leading[*to] = 0);
+        long.sort_unstable_by_key(|(to, ..)| *to);
+        let mut ways: Vec<(Place, Way)> = Vec::with_capacity(long.len());
+        ways.extend(long.into_iter().map(|(_, first, second)| {
+            let way = second.map_or(*first, |second| first.then(second));
+            (self.place(&way), way)
+        }));
+        let before =
+            |(p, v): &(Place, Way), (q, w): &(Place, Way)| p.x.total_cmp(&q.x).then_with(|| v.edges.cmp(&w.edges));
+        ways.chunk_by_mut(|p, q| p.0.to == q.0.to).for_each(|group| group.sort_unstable_by(before));
         ways
     }
 
@@ -456,9 +464,9 @@ impl Closure {
         let scales = |from: f64, to: f64| {
             std::iter::successors(Some(from), |s| Some(s * FINENESS)).take_while(move |s| *s <= to)
         };
-        let densities = |scale: f64| distances.iter().map(|z| maxwell(z.plain, scale)).collect::<Vec<f64>>();
+        let densities = |scale: f64| Lanes::of(distances.iter().map(|z| maxwell(z.plain, scale)));
         let reach = (3.0 * DECOY_DEVIATION).exp();
-        let wides: Vec<(f64, Vec<f64>)> =
+        let wides: Vec<(f64, Lanes)> =
             scales(decoy_wide / reach, decoy_wide * reach).map(|s| (s, densities(s))).collect();
         let mut best = (f64::NEG_INFINITY, Self { right: 0.0, wide: decoy_wide, chance: expected, rate, ..*guess });
         if distances.is_empty() {
@@ -471,33 +479,31 @@ impl Closure {
         let counted = |loops: f64| 0.5 * (loops + expected);
         // All of them by chance.
         let all = counted(distances.len() as f64);
-        let by_chance = |(wide, densities): &(f64, Vec<f64>)| {
+        let by_chance = |(wide, densities): &(f64, Lanes)| {
             log_product(densities.iter().map(|g| all * g))
                 - all
                 - count_prior(all)
                 - prior(*wide, decoy_wide, DECOY_DEVIATION)
         };
         let by_chance = wides.iter().map(by_chance).fold(f64::NEG_INFINITY, f64::max);
-        for narrow in scales(guess.narrow * (-2.0 * GUESS_DEVIATION).exp(), decoy_wide * reach / LEAST_RATIO) {
-            let right_densities: Vec<f64> = distances.iter().map(|m| m.density_if_right(narrow)).collect();
+        let best_with = |narrow: &f64| {
+            let (narrow, mut best) = (*narrow, best);
+            let right_densities = Lanes::of(distances.iter().map(|m| m.density_if_right(narrow)));
             // Scales that are alike have counts that are: the next begin where the last have settled.
             let (mut right, mut chance) = (0.5 * distances.len() as f64, expected);
             for (wide, chance_densities) in wides.iter().filter(|w| w.0 >= LEAST_RATIO * narrow) {
                 right = right.max(LEAST * distances.len() as f64);
-                let densities = || right_densities.iter().zip(chance_densities);
-                let both = |right: f64, chance: f64, (f, g): (&f64, &f64)| {
-                    (right * f, (right * f + chance * g).max(f64::MIN_POSITIVE))
-                };
                 for _ in 0..STEPS {
                     let before = right;
-                    let among_right: f64 = densities().map(|d| both(right, chance, d)).map(|(f, both)| f / both).sum();
+                    let among_right = widely!(right_among((right, chance), &right_densities, chance_densities));
                     chance = counted(distances.len() as f64 - among_right);
                     right = among_right;
                     if (right - before).abs() <= SETTLED * distances.len() as f64 {
                         break;
                     }
                 }
-                let value = log_product(densities().map(|d| both(right, chance, d).1))
+                let densities = right_densities.iter().zip(chance_densities.iter());
+                let value = log_product(densities.map(|(f, g)| right * f + chance * g))
                     - right
                     - chance
                     - count_prior(chance)
@@ -509,7 +515,13 @@ impl Closure {
                         (value, Self { narrow, right: right / share, wide: *wide, chance: chance / share, rate, any });
                 }
             }
-        }
+            best
+        };
+        let narrows: Vec<f64> =
+            scales(guess.narrow * (-2.0 * GUESS_DEVIATION).exp(), decoy_wide * reach / LEAST_RATIO).collect();
+        let found: Vec<(f64, Self)> = narrows.par_iter().map(best_with).collect();
+        // Of equals the first.
+        best = found.into_iter().fold(best, |best, other| if other.0 > best.0 { other } else { best });
         best.1
     }
 
@@ -544,6 +556,38 @@ impl Closure {
 const LEAST_RATIO: f64 = 2.5;
 /// Poses in islands are off by this much more than those of two steps.
 const DRIFT: f64 = 1.5;
+
+/// Numbers worked on side by side, in as many lanes as the registers of AVX2 have; zeros fill the last ones up.
+struct Lanes {
+    rows: Vec<[f64; 4]>,
+    count: usize,
+}
+
+impl Lanes {
+    fn of(numbers: impl ExactSizeIterator<Item = f64>) -> Self {
+        let count = numbers.len();
+        let mut rows = vec![[0.0; 4]; count.div_ceil(4)];
+        rows.as_flattened_mut().iter_mut().zip(numbers).for_each(|(place, number)| *place = number);
+        Self { rows, count }
+    }
+
+    fn iter(&self) -> impl Iterator<Item = f64> {
+        self.rows.as_flattened().iter().take(self.count).copied()
+    }
+}
+
+/// How many of some loops are right, given how many right and chance ones are expected and their densities among either.
+#[inline(always)]
+fn right_among((right, chance): (f64, f64), densities: &Lanes, chance_densities: &Lanes) -> f64 {
+    let mut sums = [0.0; 4];
+    for (f, g) in densities.rows.iter().zip(&chance_densities.rows) {
+        for l in 0..4 {
+            let right = right * f[l];
+            sums[l] += right / (right + chance * g[l]).max(f64::MIN_POSITIVE);
+        }
+    }
+    sums.iter().sum()
+}
 
 /// Logarithm of a product of positive numbers, which may be too small for one.
 fn log_product(factors: impl Iterator<Item = f64>) -> f64 {
