@@ -6,7 +6,7 @@
 //! (Tinney and Walker 1967; about O(n log n) of fill on the planar graph of a puzzle). The first node of each connected part
 //! stays where it is.
 
-use nalgebra::{Matrix3, Point2, UnitComplex, Vector3};
+use nalgebra::{Matrix3, Point2, UnitComplex, Vector2, Vector3};
 
 /// A contact: the motion `d` of node `a` relative to node `b` at `centre` costs `½ dᵀ hessian d + gradientᵀ d`.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -22,6 +22,13 @@ pub(crate) struct Factor {
 pub(crate) fn lever(from: Point2<f64>, to: Point2<f64>) -> Matrix3<f64> {
     let d = to - from;
     Matrix3::new(1.0, 0.0, -d.y, 0.0, 1.0, d.x, 0.0, 0.0, 1.0)
+}
+
+/// A matrix times [`lever`] of an arm, most of which is zeros and ones.
+fn levered(mut matrix: Matrix3<f64>, arm: Vector2<f64>) -> Matrix3<f64> {
+    let turn = matrix.column(0) * -arm.y + matrix.column(1) * arm.x + matrix.column(2);
+    matrix.set_column(2, &turn);
+    matrix
 }
 
 /// A turn of the axes in which a small motion (x, y, turn) is given.
@@ -56,7 +63,9 @@ pub(crate) struct Plan {
 impl Plan {
     /// So many nodes; of those left the one with the fewest neighbours is eliminated first.
     pub(crate) fn new(n: usize, factors: &[Factor]) -> Self {
-        let mut around: Vec<Vec<usize>> = vec![Vec::new(); n];
+        /// Neighbours of a piece in a grid, and as many again that elimination brings.
+        const NEIGHBOURS: usize = 16;
+        let mut around: Vec<Vec<usize>> = (0..n).map(|_| Vec::with_capacity(NEIGHBOURS)).collect();
         for f in factors.iter().filter(|f| f.a != f.b) {
             around[f.a].push(f.b);
             around[f.b].push(f.a);
@@ -130,16 +139,16 @@ impl Plan {
         let row = |k: usize| self.starts[k]..self.starts[k + 1];
         let mut weight = 0.0f64;
         for f in factors {
-            let (ja, jb) = (lever(references[f.a], f.centre), lever(references[f.b], f.centre));
-            let (ha, hb) = (ja.transpose() * f.hessian, jb.transpose() * f.hessian);
+            let [arm_a, arm_b] = [f.a, f.b].map(|k| f.centre - references[k]);
+            let [ha, hb] = [arm_a, arm_b].map(|arm| levered(f.hessian.transpose(), arm).transpose());
             let (a, b) = (self.place[f.a], self.place[f.b]);
-            pivots[a] += ha * ja;
-            pivots[b] += hb * jb;
+            pivots[a] += levered(ha, arm_a);
+            pivots[b] += levered(hb, arm_b);
             if let Some(k) = self.block(f) {
-                blocks[k] -= if a < b { ha * jb } else { hb * ja };
+                blocks[k] -= if a < b { levered(ha, arm_b) } else { levered(hb, arm_a) };
             }
-            right[a] -= ja.transpose() * f.gradient;
-            right[b] += jb.transpose() * f.gradient;
+            right[a] -= lever(references[f.a], f.centre).tr_mul(&f.gradient);
+            right[b] += lever(references[f.b], f.centre).tr_mul(&f.gradient);
             weight = weight.max(f.hessian.diagonal().max());
         }
         // Gauge: the first node of each connected part is held; a trace of damping on the rest for slack contacts.

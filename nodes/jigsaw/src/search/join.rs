@@ -171,11 +171,12 @@ impl Assembler<'_> {
     /// Greatest overlap of two pieces of different islands, in squared piece scales.
     fn islands_overlap(&self, ia: usize, ib: usize, b_from_a: &Isometry2<f64>) -> f64 {
         let mut worst = 0.0f64;
+        let others: Vec<(usize, Point2<f64>)> = self.state.members(ib).map(|q| (q, self.centre_of(q))).collect();
         for p in self.state.members(ia) {
             let centre = b_from_a * self.centre_of(p);
-            for q in self.state.members(ib) {
+            for &(q, other) in &others {
                 let reach = self.outlines[p].radius + self.outlines[q].radius;
-                if (centre - self.centre_of(q)).norm_squared() > reach * reach {
+                if (centre - other).norm_squared() > reach * reach {
                     continue;
                 }
                 let q_from_p = self.state.pose(q).inverse() * b_from_a * self.state.pose(p);

@@ -11,7 +11,6 @@ use super::Assembler;
 use crate::loops::{self, Closure, Edge, Tolerance};
 use crate::placement::Joint;
 use crate::slots::{Slot, Slots};
-use std::collections::HashSet;
 
 /// Loops of refined poses close to within this on real pieces (0.8 % and 0.44° measured); calibration tightens it.
 const LOOSE: Tolerance = Tolerance { position: 0.04, angle: 0.05 };
@@ -195,10 +194,11 @@ impl Assembler<'_> {
         const FEW: usize = 4;
         const STEPS: usize = 12;
         let mut right: Vec<f64> = trusted.iter().map(|k| self.edges[*k].cost).collect();
-        let settled: HashSet<Slot> = trusted.iter().map(|k| self.edges[*k].slots[1]).collect();
+        let mut settled = vec![false; self.slots.count()];
+        trusted.iter().for_each(|k| settled[self.edges[*k].slots[1].number] = true);
         let mut wrong: Vec<(f64, f64)> = trusted.iter().filter_map(|k| Some((self.best_other(*k)?, 1.0))).collect();
         let rest: Vec<(f64, Option<f64>)> = (0..self.edges.len())
-            .filter(|k| self.edges[*k].mouth_rank == 0 && !settled.contains(&self.edges[*k].slots[1]))
+            .filter(|k| self.edges[*k].mouth_rank == 0 && !settled[self.edges[*k].slots[1].number])
             .map(|k| (self.edges[k].cost, self.best_other(k)))
             .collect();
         if right.len() < FEW || wrong.len() + rest.len() < FEW {

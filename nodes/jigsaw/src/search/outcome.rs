@@ -8,8 +8,7 @@ use super::learn::{AGREEMENT, IMPLAUSIBLE};
 use super::{Assembler, Mated, Outcome, edge};
 use crate::Policy;
 use crate::placement::{self, Joint};
-use crate::slots::Slot;
-use std::collections::{BTreeMap, HashMap};
+use std::collections::BTreeMap;
 
 /// An island of at most so many pieces is stray if the largest is this many times as large: pieces that lie face down
 /// or twice may well mate with one another, but where they belong is taken. Halves of mixed puzzles are larger.
@@ -88,7 +87,7 @@ impl Assembler<'_> {
     fn finish(&mut self) -> Outcome {
         let n = self.outlines.len();
         let mut matings = Vec::new();
-        let mut taken: HashMap<Slot, usize> = HashMap::new();
+        let mut taken = vec![false; self.slots.count()];
         let paper = self.params.policy == Policy::Paper;
         // Unrefined poses contradict each other too much to recognise contacts that weren't decided on.
         let mut order: Vec<usize> = if paper {
@@ -108,13 +107,13 @@ impl Assembler<'_> {
             let slots = self.edges[k].slots;
             let own = self.model.evidence(self.edges[k].cost);
             let loops = self.edges[k].support.min(2) as f64 * AGREEMENT;
-            if slots.iter().any(|s| taken.contains_key(s)) || (!paper && own + loops < IMPLAUSIBLE) {
+            if slots.iter().any(|s| taken[s.number]) || (!paper && own + loops < IMPLAUSIBLE) {
                 continue;
             }
             // What was only looked for because the pieces lie there is no further evidence that they do.
             let more = if k < candidates { (own + self.present).max(0.0) + AGREEMENT } else { 0.0 };
             for s in slots {
-                taken.insert(s, k);
+                taken[s.number] = true;
                 evidence[s.piece] += more;
             }
             chosen.push(k);
