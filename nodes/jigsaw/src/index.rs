@@ -1,11 +1,13 @@
-//! Shape index: the tabs whose isthmus distance function (IDF) is nearest to that of a mouth.
+//! Shape index: the tabs whose isthmus distance function (IDF), and the flanks beside it, are nearest to those of a mouth.
 //!
 //! A k-d tree over the leading cosine coefficients of the mean-removed IDF. The distance between two sets of
 //! coefficients never exceeds the root mean square difference of the whole functions, so the k nearest under the
-//! whole difference are exact. Neck width and path length are windows that each candidate must pass. Building is
+//! whole difference are exact. Where all tabs are cut after one template and differ in little but where they sit on their sides, hundreds have
+//! nearly the same IDF, and the flanks tell them apart: they are compared where the samples of the two segments lie on each other best
+//! (W. Kabsch, *A solution for the best rotation to relate two sets of vectors*, 1976), which adds to the difference. Neck width and path length are windows that each candidate must pass. Building is
 //! O(n log n), a query O(k log n) on the clustered shapes of tabs (measured growth: see the benches).
 
-use crate::outline::{KEYS, Outline, SHAPE_SAMPLES, Segment};
+use crate::outline::{FLANK_SAMPLES, KEYS, Outline, SHAPE_SAMPLES, Segment};
 
 /// Entries a leaf of the tree holds: below this a linear scan is faster than descending.
 const LEAF: usize = 16;
@@ -29,6 +31,12 @@ const OPENING_WINDOW: f64 = 0.15;
 /// Window on the difference of path lengths, in piece scales: the critical points of a neck with near-parallel sides
 /// may slide along it.
 const PATH_WINDOW: f64 = 0.4;
+
+/// Most that a flank's distance from the other's counts for, in piece scales: a corner that was not told, on one of the two, must not outweigh the
+/// likeness of the tabs.
+const MOST_ASIDE: f32 = 0.015;
+/// Most distance that the flanks have in common, in piece scales: clearance on both sides.
+const MOST_IN_COMMON: f32 = 0.03;
 
 /// Which differences of width and path length (mouth less neck), in pixels, a candidate may have.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -172,7 +180,11 @@ impl Query<'_> {
         if squares(&self.mouth.keys, &entry.segment.keys).sqrt() > limit {
             return;
         }
-        let distance = shape_distance(self.mouth, entry.segment);
+        let shape = shape_distance(self.mouth, entry.segment);
+        if shape > limit {
+            return;
+        }
+        let distance = shape.hypot(flank_distance(self.mouth, entry.segment));
         let hit = Hit { distance, rank: entry.rank, piece: entry.piece, tab: entry.tab };
         if distance > limit {
             return;
@@ -197,4 +209,32 @@ pub(crate) fn shape_distance(a: &Segment, b: &Segment) -> f32 {
         }
     }
     (lanes.iter().sum::<f32>() / SHAPE_SAMPLES as f32).sqrt()
+}
+
+/// Root mean square distance of the flanks of a tab from those of a mouth, in pixels, where the two are put on each other by the samples of
+/// their segments; what they have in common, and flanks that end at a corner of the piece, don't count.
+fn flank_distance(mouth: &Segment, tab: &Segment) -> f32 {
+    let (mut dot, mut cross) = (0.0, 0.0);
+    let [[xs, ys], [us, vs]] = [&tab.samples, &mouth.samples];
+    for (((x, y), u), v) in xs.iter().zip(ys).zip(us).zip(vs) {
+        dot += x * u + y * v;
+        cross += x * v - y * u;
+    }
+    let norm = dot.hypot(cross).max(f32::MIN_POSITIVE);
+    let (cos, sin) = (dot / norm, cross / norm);
+    let mut asides = [0f32; 2 * FLANK_SAMPLES];
+    let mut count = 0;
+    for end in 0..2 {
+        let reach = tab.reach[end].min(mouth.reach[end]);
+        let pairs = tab.flanks[end].iter().zip(&mouth.flanks[end]).zip(&mouth.leans[end]);
+        for (([x, y], [u, v]), [nx, ny]) in pairs.take(reach) {
+            asides[count] = nx * (u - (cos * x - sin * y)) + ny * (v - (sin * x + cos * y));
+            count += 1;
+        }
+    }
+    let asides = &asides[..count];
+    let [most, in_common] = [MOST_ASIDE, MOST_IN_COMMON].map(|part| part * mouth.scale);
+    let mean = (asides.iter().sum::<f32>() / count.max(1) as f32).clamp(-in_common, in_common);
+    let squares: f32 = asides.iter().map(|d| (d - mean).abs().min(most).powi(2)).sum();
+    (squares / (2 * FLANK_SAMPLES) as f32).sqrt()
 }

@@ -13,6 +13,10 @@ use std::sync::LazyLock;
 pub(crate) const SHAPE_SAMPLES: usize = 64;
 /// Points of a match segment by which it is posed roughly: three to each of the eight bends of a tab.
 pub(crate) const ROUGH_SAMPLES: usize = 24;
+/// Samples of the flanks on either side of a match segment, in the shape index: two to each of their bends.
+pub(crate) const FLANK_SAMPLES: usize = 6;
+/// How far they are apart, as a part of the path: together they reach as far as a segment is extended at most.
+const FLANK_STEP: f64 = 0.08;
 /// Cosine coefficients of the IDF by which the index narrows the choice; the rest of the energy is small.
 pub(crate) const KEYS: usize = 8;
 /// How far a match segment is extended beyond its critical points at most, in piece scales (the shoulders up to the
@@ -60,6 +64,14 @@ pub(crate) struct Segment {
     pub(crate) samples: [[f32; ROUGH_SAMPLES]; 2],
     /// Middle of the samples, relative to the isthmus point.
     pub(crate) middle: [f32; 2],
+    /// Points beyond either end of the segment, at equal parts of the path, relative to `middle`; in running order the first end, then the other.
+    pub(crate) flanks: [[[f32; 2]; FLANK_SAMPLES]; 2],
+    /// Outward normals there.
+    pub(crate) leans: [[[f32; 2]; FLANK_SAMPLES]; 2],
+    /// How many of them lie on the side that the segment is a part of.
+    pub(crate) reach: [usize; 2],
+    /// Scale of the piece.
+    pub(crate) scale: f32,
     /// Border points of the extended segment in running order: every border point for a mouth, thinned for a tab.
     pub(crate) run: Vec<Node>,
     /// Border length between two nodes of `run`.
@@ -265,6 +277,13 @@ impl Outline {
         let first = (isthmus.arc[0] / self.spacing).ceil() as i64;
         let last = ((isthmus.arc[0] + isthmus.path_length) / self.spacing).floor() as i64;
         let (before, after) = (self.extension(isthmus, first, -1), self.extension(isthmus, last, 1));
+        let flank_step = FLANK_STEP * isthmus.path_length;
+        let ends = [(isthmus.arc[0], -1.0, before), (isthmus.arc[0] + isthmus.path_length, 1.0, after)];
+        let ends = if tab { ends } else { [ends[1], ends[0]] };
+        let flank = |(from, direction, _): (f64, f64, i64)| {
+            std::array::from_fn(|k| from + direction * flank_step * (k + 1) as f64)
+        };
+        let arcs: [[f64; FLANK_SAMPLES]; 2] = ends.map(flank);
         // A tab is sampled as densely as its IDF; a mouth keeps every point, for its feet are looked for on it.
         let thin = if tab { ((last - first) as usize / SHAPE_SAMPLES).max(1) as i64 } else { 1 };
         let n = self.points.len() as i64;
@@ -291,6 +310,20 @@ impl Outline {
             shape,
             samples: [points.map(|p| (p.x - middle.x) as f32), points.map(|p| (p.y - middle.y) as f32)],
             middle: [middle.x as f32, middle.y as f32],
+            flanks: arcs.map(|arcs| {
+                arcs.map(|arc| {
+                    let p = self.at_arc(arc) - isthmus.point - middle;
+                    [p.x as f32, p.y as f32]
+                })
+            }),
+            leans: arcs.map(|arcs| {
+                arcs.map(|arc| {
+                    let normal = self.normals[((arc / self.spacing).round() as i64).rem_euclid(n) as usize];
+                    [normal.x, normal.y]
+                })
+            }),
+            reach: ends.map(|(_, _, points)| ((points as f64 * self.spacing / flank_step) as usize).min(FLANK_SAMPLES)),
+            scale: self.scale as f32,
             run,
             step: thin as f64 * self.spacing,
             core: core_from.min(core_to)..core_to,

@@ -109,7 +109,7 @@ fn nothing_is_wrong_on_the_way() {
 /// Pieces that others hold in place mate with all their neighbours, whether the index thought so or not.
 #[test]
 fn a_contact_is_a_mating_even_if_it_was_no_candidate() {
-    let options = Options { similarity: 0.95, seed: 5, ..Options::default() };
+    let options = Options { similarity: 0.98, seed: 5, ..Options::default() };
     let (score, assembly) = solve(&options, &Params { candidates: 1, ..Params::default() });
     assert!(score.is_perfect() && score.right_matings == score.joints, "{score:?}");
     // With one candidate a mouth, what is beyond one a mouth was found in contact.

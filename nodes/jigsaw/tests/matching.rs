@@ -1,7 +1,12 @@
 //! The candidate table, the budget, and that neither order nor threads change anything.
 
+use isthmus::contour::Border;
+use isthmus::{Features, Point};
 use jigsaw::generate::{Options, Puzzle};
 use jigsaw::{Assembly, Budget, Candidate, Fate, Params, Piece, Policy, Rule, Solver};
+use nalgebra::Vector2;
+use rand::{RngExt, SeedableRng};
+use rand_chacha::ChaCha8Rng;
 use std::collections::HashSet;
 use std::sync::atomic::{AtomicUsize, Ordering};
 
@@ -160,4 +165,82 @@ fn neither_order_nor_threads_change_a_bit() {
         growing.insert(taken).expect("was taken out");
         check(&mut growing, format!("{threads} threads, every {step}-th, one by one"));
     }
+}
+
+/// A joint as templates for laser cutters have it: three cubic curves. All tabs are alike; they sit a little aside, higher or lower, lean a little, and their
+/// flanks leave the corners in somewhat different directions.
+fn template(from: Point, to: Point, rng: &mut ChaCha8Rng) -> Vec<Point> {
+    const TAB: f64 = 0.1;
+    const JITTER: f64 = 0.04;
+    const STEPS: usize = 24;
+    let [a, b, c, d, e] = std::array::from_fn(|_| rng.random_range(-JITTER..JITTER));
+    let along = to - from;
+    let up = Vector2::new(along.y, -along.x) * if rng.random() { 1.0 } else { -1.0 };
+    let controls = [
+        (0.0, 0.0),
+        (0.2, a),
+        (0.5 + b + d, c - TAB),
+        (0.5 + b - TAB, c + TAB),
+        (0.5 + b - d - 2.0 * TAB, c + 3.0 * TAB),
+        (0.5 + b - d + 2.0 * TAB, c + 3.0 * TAB),
+        (0.5 + b + TAB, c + TAB),
+        (0.5 + b + d, c - TAB),
+        (0.8, e),
+        (1.0, 0.0),
+    ]
+    .map(|(x, y)| from + along * x + up * y);
+    let curve = |k: usize| {
+        let [p, q, r, s] = std::array::from_fn(|i| controls[k + i].coords);
+        (0..STEPS).map(move |i| {
+            let t = i as f64 / STEPS as f64;
+            let u = 1.0 - t;
+            Point::from(p * (u * u * u) + q * (3.0 * u * u * t) + r * (3.0 * u * t * t) + s * (t * t * t))
+        })
+    };
+    [0, 3, 6].into_iter().flat_map(curve).chain([to]).collect()
+}
+
+/// Of hundreds of tabs after one template the flanks tell which belongs into a mouth: few candidates are enough.
+#[test]
+fn tabs_of_one_template_are_told_by_their_flanks() {
+    const PITCH: f64 = 100.0;
+    /// Waves of each piece's own on its border: wear.
+    const WAVES: f64 = 0.15;
+    let (rows, columns) = (12, 16);
+    let mut rng = ChaCha8Rng::seed_from_u64(3);
+    let corner = |row: usize, column: usize| Point::new(column as f64 * PITCH, row as f64 * PITCH);
+    let mut lines = |is_down: bool| -> Vec<Vec<Vec<Point>>> {
+        let mut line = |row: usize, column: usize| {
+            let (next, is_rim) = if is_down {
+                (corner(row + 1, column), column == 0 || column == columns)
+            } else {
+                (corner(row, column + 1), row == 0 || row == rows)
+            };
+            let from = corner(row, column);
+            if is_rim { vec![from, next] } else { template(from, next, &mut rng) }
+        };
+        let [last_row, last_column] = if is_down { [rows, columns + 1] } else { [rows + 1, columns] };
+        (0..last_row).map(|row| (0..last_column).map(|column| line(row, column)).collect()).collect()
+    };
+    let (across, down) = (lines(false), lines(true));
+    let piece = |k: usize| {
+        let (row, column) = (k / columns, k % columns);
+        let back = |line: &[Point]| line.iter().rev().copied().collect::<Vec<_>>();
+        let sides = [
+            across[row][column].clone(),
+            down[row][column + 1].clone(),
+            back(&across[row + 1][column]),
+            back(&down[row][column]),
+        ];
+        let phase = k as f64;
+        let worn = |p: Point| p + Vector2::new((p.y / 3.0 + phase).sin(), (p.x / 3.0 - phase).sin()) * WAVES;
+        let outline: Vec<Point> = sides.into_iter().flatten().map(worn).collect();
+        let border = Border::from_points(&outline).expect("an outline");
+        Piece { id: format!("{k}"), features: Features::from_border(border, 0.02).expect("features") }
+    };
+    let pieces: Vec<Piece> = (0..rows * columns).map(piece).collect();
+    let assembly = solver(&pieces, Params { candidates: 8, ..Params::default() }).solve();
+    assert_eq!(assembly.unplaced, [] as [usize; 0]);
+    assert!(assembly.placements.iter().all(|p| p.component == 0));
+    assert_eq!(assembly.matings.len(), rows * (columns - 1) + (rows - 1) * columns);
 }
