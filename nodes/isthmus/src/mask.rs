@@ -14,7 +14,7 @@
 //!    divided by the local contrast. Pixels beyond half-way are joined to components once more: neighbours whose shadows
 //!    or glow met come apart. Where a part of the border is soft, it is sought within the shadow that makes it so ([`Segmentation::shaded`]). Threads that hang on a shape (hairs) are taken off.
 //! 5. *Rejection*, each with its [`Reason`]: cut by the frame's edge, too small beside the others, thread-like (hairs,
-//!    scanner edges), soft beside sharp ones or faint without a crisp edge (glare), convex beside such with bays (coins, labels, rulers), two shapes that touch (of about twice the usual area, with an isthmus between the halves). Where that
+//!    scanner edges), soft beside sharp ones or faint without a crisp edge (glare), convex beside such with bays (coins, labels, rulers), two shapes that touch (of about twice the usual area, with an isthmus between the halves; it is a waist where most large shapes have none). Where that
 //!    isthmus is too narrow to be the neck of one of them they are cut apart instead ([`Segmentation::separated`]).
 //!
 //! # Cost

@@ -479,3 +479,40 @@ fn two_pieces_that_overlap_are_named() {
         assert_eq!(found.separated, []);
     }
 }
+
+/// Pieces of many sizes, one with a waist between two lobes of the size of the smaller ones: it is whole, as the other large ones are. Beside smaller ones alone it
+/// may be two that touch.
+#[test]
+fn a_waist_is_no_contact_where_pieces_are_of_many_sizes() {
+    const SMALL: f64 = 110.0;
+    const LARGE: f64 = 180.0;
+    let usual = Piece::usual(SMALL);
+    let lobe = |facing: usize| {
+        let mut lobe = Piece { sides: [None; 4], ..usual.clone() };
+        lobe.sides[facing] = usual.sides[0];
+        lobe
+    };
+    let smaller = (0..4u64).map(|k| (Piece::random(SMALL, 20 + k), (110.0, 120.0 + 200.0 * k as f64)));
+    let larger = [(Piece::random(LARGE, 30), (730.0, 220.0)), (Piece::random(LARGE, 31), (720.0, 660.0))];
+    let waist = [(lobe(1), (330.0, 450.0)), (lobe(3), (330.0 + 1.18 * SMALL, 450.0))];
+    for (has_larger, reasons) in [(true, vec![]), (false, vec![Reason::Touching])] {
+        let pieces = smaller.clone().chain(waist.clone()).chain(larger.clone().into_iter().filter(|_| has_larger));
+        let outlines: Vec<_> = pieces.map(|(piece, (x, y))| piece.outline(&pose(0.0, 1.0, x, y))).collect();
+        let camera = Camera { width: SIDE, height: SIDE, noise: 3.0, ..Camera::default() };
+        let found = grey(&camera.picture(&outlines));
+        assert_eq!(found.rejected.iter().map(|r| r.reason).collect::<Vec<_>>(), reasons, "{has_larger}");
+        assert_eq!(found.cutouts.len(), if has_larger { 7 } else { 4 });
+    }
+}
+
+/// The edge of a sheet along the frame's edge, longer than any piece and thin: no piece is lost there.
+#[test]
+fn the_edge_of_a_sheet_is_no_piece_that_the_frame_cuts() {
+    let (mut pixels, necks) = scene(Camera { noise: 3.0, ..Camera::default() });
+    for row in pixels.chunks_exact_mut(SIDE) {
+        row[SIDE - 14..].fill(50);
+    }
+    let found = grey(&pixels);
+    check(&found, &necks, "sheet");
+    assert_eq!(found.rejected.iter().map(|r| r.reason).collect::<Vec<_>>(), [Reason::Thread]);
+}

@@ -33,6 +33,11 @@ const TOUCHING_WIDTH: f64 = 0.35;
 /// would keep the other's tab.
 const SEPARABLE_WIDTH: f64 = 0.1;
 
+/// What touches the frame's edge, longer than this many times the square root of the typical area: no piece is so long.
+const STRIP_LENGTH: f64 = 2.5;
+/// ... and thinner on the mean than this part of the same: the edge of a sheet or of the scanner's glass, of which pieces show more.
+const STRIP_WIDTH: f64 = 0.1;
+
 /// How far on either side of a border levels are compared to tell a crisp edge, as a part of the square root of the shape's area: light that falls off
 /// from a spot's middle to its rim does so little there.
 const EDGE_REACH: f64 = 0.05;
@@ -118,6 +123,16 @@ pub(super) fn sift(
         .filter(|a| *a as f64 >= parameters.min_relative_area * typical_area as f64)
         .collect();
     let median_area = if usual.len() < TOUCHING_SHAPES { usize::MAX } else { usual[(usual.len() - 1) / 2] };
+    let typical_side = (typical_area as f64).sqrt();
+    let is_strip = |f: &Found| {
+        let length = f64::from(f.cutout.aoi.width.max(f.cutout.aoi.height));
+        length > STRIP_LENGTH * typical_side && f.area as f64 <= STRIP_WIDTH * typical_side * length
+    };
+    let is_large = |f: &Found| f.area as f64 >= TOUCHING_AREA * median_area as f64;
+    // Where large shapes are whole as a rule, shapes are of many sizes, and a waist is no contact.
+    let large = found.iter().filter(|f| f.contact == 0 && !f.is_convex && is_large(f));
+    let whole = large.map(|f| contact(&f.cutout, median_area as f64).is_none()).collect::<Vec<_>>();
+    let are_alike = 2 * whole.iter().filter(|is_whole| **is_whole).count() <= whole.len();
     let mut cutouts = Vec::new();
     let mut convex = Vec::new();
     let mut separated = Vec::new();
@@ -132,13 +147,13 @@ pub(super) fn sift(
         {
             Some(Reason::Faint)
         } else if f.contact > 0 && !is_tight(&f) {
-            Some(Reason::CutByFrame)
-        } else if f.area as f64 >= TOUCHING_AREA * median_area as f64
+            Some(if is_strip(&f) { Reason::Thread } else { Reason::CutByFrame })
+        } else if is_large(&f)
             && let Some(contact) = contact(&f.cutout, median_area as f64)
         {
             let parts = part(&f, contact, median_area as f64);
             if parts.is_empty() {
-                Some(Reason::Touching)
+                are_alike.then_some(Reason::Touching)
             } else {
                 separated.push(aoi);
                 open.extend(parts);
