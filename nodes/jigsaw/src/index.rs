@@ -33,8 +33,9 @@ const OPENING_WINDOW: f64 = 0.15;
 const PATH_WINDOW: f64 = 0.4;
 
 /// Most that a flank's distance from the other's counts for, in piece scales: a corner that was not told, on one of the two, must not outweigh the
-/// likeness of the tabs.
-const MOST_ASIDE: f32 = 0.015;
+/// likeness of the tabs, and the tree is searched as far as that (10 000 pieces are matched in twice the time that it takes without flanks, at 0.015 in
+/// more than three times).
+const MOST_ASIDE: f32 = 0.005;
 /// Most distance that the flanks have in common, in piece scales: clearance on both sides.
 const MOST_IN_COMMON: f32 = 0.03;
 

@@ -239,7 +239,7 @@ fn tabs_of_one_template_are_told_by_their_flanks() {
         Piece { id: format!("{k}"), features: Features::from_border(border, 0.02).expect("features") }
     };
     let pieces: Vec<Piece> = (0..rows * columns).map(piece).collect();
-    let assembly = solver(&pieces, Params { candidates: 8, ..Params::default() }).solve();
+    let assembly = solver(&pieces, Params { candidates: 16, ..Params::default() }).solve();
     assert_eq!(assembly.unplaced, [] as [usize; 0]);
     assert!(assembly.placements.iter().all(|p| p.component == 0));
     assert_eq!(assembly.matings.len(), rows * (columns - 1) + (rows - 1) * columns);
