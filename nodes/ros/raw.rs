@@ -218,7 +218,9 @@ impl Session {
             subscriber.create_simple_datareader_no_key(&dds_topic, None).map_err(fail)?;
         // So that a publisher that offers less is warned of by name.
         self.endpoints.opened(reader.guid(), &name);
-        let (mut sender, receiver) = mpsc::channel(CHANNEL_DEPTH);
+        // As for a topic of the cell: what is left in the middleware is lost when its publisher ends.
+        let waiting = if qos.reliable { qos.depth.max(CHANNEL_DEPTH) } else { CHANNEL_DEPTH };
+        let (mut sender, receiver) = mpsc::channel(waiting);
         self.spawn(async move {
             let mut samples = Box::pin(reader.as_async_stream());
             while let Some(sample) = samples.next().await {

@@ -6,11 +6,12 @@
 use std::cell::RefCell;
 use std::collections::{HashMap, HashSet};
 use std::rc::Rc;
-use std::sync::Arc;
+use std::sync::{Arc, Mutex, PoisonError};
 
 use futures::channel::{mpsc, oneshot};
 use futures::{SinkExt, StreamExt};
 use jigsaw_msgs::{Message, Service};
+use ros2_client::qos::{History, Reliability};
 use ros2_client::{Context, MessageInfo, MessageTypeName, Node, QosProfile, Subscription};
 use rustdds::{GUID, RTPSEntity};
 
@@ -22,8 +23,8 @@ use super::names::{NameError, NodeNames};
 use super::params::Parameters;
 use super::topics::{TOPIC_PREFIX, Topic};
 
-/// Messages that may wait between the middleware and a node's loop. Few: what waits further out waits in the
-/// middleware's cache, whose depth is the topic's.
+/// Messages that may wait between two stages. Few: what waits further out waits in the stage before, or in the middleware's
+/// cache.
 pub const CHANNEL_DEPTH: usize = 4;
 
 /// Why a node could not be opened.
@@ -117,17 +118,20 @@ impl Session {
     ///
     /// # Errors
     /// As for [`Self::subscribe`].
-    pub(super) fn subscribe_as<M: Message, T: 'static>(
+    pub(super) fn subscribe_as<M: Message, T: Send + 'static>(
         &mut self,
         topic: &Topic<M>,
-        make: impl Fn(M, MessageInfo) -> T + 'static,
+        make: impl Fn(M, MessageInfo) -> T + Send + 'static,
     ) -> Result<mpsc::Receiver<T>, SessionError> {
         let (name, dds_topic) = self.dds_topic(topic)?;
         let subscription = self.reader_opener().open::<M>(&name, &dds_topic, None)?;
-        let (sender, receiver) = mpsc::channel(CHANNEL_DEPTH);
-        self.spawn(hand_on(subscription, name, Arc::clone(&self.health), sender, move |message, info| {
-            Some(make(message, info))
-        }));
+        let (sender, receiver) = mpsc::channel(waiting(&topic.qos));
+        listen(
+            &self.executor,
+            hand_on(subscription, name, Arc::clone(&self.health), sender, move |message, info| {
+                Some(make(message, info))
+            }),
+        );
         Ok(receiver)
     }
 
@@ -141,26 +145,28 @@ impl Session {
 
     /// As [`Self::subscribe_as`]. A publisher that offers less than the topic asks for is heard too: by a subscription that
     /// asks for no more, opened when the first of its kind is met, which hears that kind alone.
-    pub(super) fn subscribe_to_all_as<M: Message, T: 'static>(
+    pub(super) fn subscribe_to_all_as<M: Message, T: Send + 'static>(
         &mut self,
         topic: &Topic<M>,
-        make: impl Fn(M, MessageInfo) -> T + Clone + 'static,
+        make: impl Fn(M, MessageInfo) -> T + Clone + Send + 'static,
     ) -> Result<mpsc::Receiver<T>, SessionError> {
         let (name, dds_topic) = self.dds_topic(topic)?;
         let opener = self.reader_opener();
         let subscription = opener.open::<M>(&name, &dds_topic, None)?;
         let mut met = self.endpoints.lesser_writers(subscription.guid());
-        let (sender, receiver) = mpsc::channel(CHANNEL_DEPTH);
+        let (sender, receiver) = mpsc::channel(waiting(&topic.qos));
         let (qos, executor, health) = (topic.qos.clone(), Rc::clone(&self.executor), Arc::clone(&self.health));
         let every = make.clone();
-        self.spawn(hand_on(subscription, name.clone(), Arc::clone(&health), sender.clone(), move |message, info| {
-            Some(every(message, info))
-        }));
+        let handing_on =
+            hand_on(subscription, name.clone(), Arc::clone(&health), sender.clone(), move |message, info| {
+                Some(every(message, info))
+            });
+        listen(&self.executor, handing_on);
         self.spawn(async move {
-            let offers: Rc<RefCell<HashMap<GUID, Offer>>> = Rc::default();
+            let offers: Arc<Mutex<HashMap<GUID, Offer>>> = Arc::default();
             let mut heard = HashSet::new();
             while let Some(LesserWriter { writer, offer }) = met.next().await {
-                offers.borrow_mut().insert(writer, offer);
+                offers.lock().unwrap_or_else(PoisonError::into_inner).insert(writer, offer);
                 if !heard.insert(offer) {
                     continue;
                 }
@@ -172,14 +178,16 @@ impl Session {
                     }
                 };
                 log::info!("a publisher on {name} offers less than is asked for, and is heard all the same: {offer:?}");
-                let (offers, make) = (Rc::clone(&offers), make.clone());
+                let (offers, make) = (Arc::clone(&offers), make.clone());
                 let of_its_kind = move |message, info: MessageInfo| {
                     // What offers more is heard by another subscription.
-                    let is_this = offers.borrow().get(&info.publisher_gid().into()) == Some(&offer);
+                    let is_this =
+                        offers.lock().unwrap_or_else(PoisonError::into_inner).get(&info.publisher_gid().into())
+                            == Some(&offer);
                     is_this.then(|| make(message, info))
                 };
                 let handing_on = hand_on(subscription, name.clone(), Arc::clone(&health), sender.clone(), of_its_kind);
-                executor.spawn(handing_on).detach();
+                listen(&executor, handing_on);
             }
         });
         Ok(receiver)
@@ -260,6 +268,15 @@ impl Session {
     }
 }
 
+/// Messages of a topic that may wait between the middleware and a node's loop. Of a reliable one all that the middleware
+/// keeps: RustDDS gives out nothing more of a writer that is gone, though it was received and acknowledged.
+fn waiting(qos: &QosProfile) -> usize {
+    match (&qos.reliability, &qos.history) {
+        (Reliability::Reliable { .. }, History::KeepLast { depth }) => (*depth).max(CHANNEL_DEPTH),
+        _ => CHANNEL_DEPTH,
+    }
+}
+
 /// Opens subscriptions of a node, also while it runs.
 struct ReaderOpener {
     node: Rc<RefCell<Node>>,
@@ -282,6 +299,12 @@ impl ReaderOpener {
         self.endpoints.opened(subscription.guid(), name);
         Ok(subscription)
     }
+}
+
+/// Runs what hands on messages for as long as the executor lives, on a thread that does nothing else: the loop of a node works
+/// for milliseconds at a time, in which a writer may come and go.
+fn listen(executor: &smol::LocalExecutor<'static>, handing_on: impl Future<Output = ()> + Send + 'static) {
+    executor.spawn(smol::spawn(handing_on)).detach();
 }
 
 /// Hands what a subscription hears on to a channel, as long as someone takes it there.

@@ -8,6 +8,7 @@ from jigsaw_msgs.msg import Assembly, PieceFeatures, PieceImage
 from PIL import Image as Picture
 from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
 from rcl_interfaces.srv import SetParameters
+from rclpy.duration import Duration
 from rclpy.qos import QoSProfile
 from sensor_msgs.msg import CompressedImage, Image
 from std_srvs.srv import Trigger
@@ -26,6 +27,7 @@ from bench import (
     image_message,
 )
 
+BURST = 400  # compressed frames: sent and acknowledged far sooner than they are decoded
 SHIFT = 1  # pixels by which a piece is moved that counts as lying still: far less than 3 % of its area
 
 
@@ -230,3 +232,21 @@ def test_same_place_overlap_takes_effect(launcher, ros, generate):
     Settings(ros, "capture_node").set("same_place_overlap", 1.0)
     camera.show(image_message(numpy.roll(picture, 2 * SHIFT, axis=1), Time(sec=3)))
     assert 2 not in camera.features, "it lies where it lay"
+
+
+def test_frames_outlive_a_camera_that_leaves(launcher, ros, generate):
+    launcher.start("capture_node")
+    monitor, node = Monitor(ros), ros.node("camera")
+    camera = node.create_publisher(CompressedImage, "image/compressed", QoSProfile(depth=BURST))
+    ros.until(lambda: camera.get_subscription_count() > 0, "listener on image/compressed")
+    monitor.status("capture_node")
+    frames = [compressed_message(grey(path), Time()) for path in generate(2, 3, 5).frames]
+    for second in range(BURST):
+        message = frames[second % len(frames)]
+        message.header.stamp.sec = second
+        camera.publish(message)
+    assert camera.wait_for_all_acked(Duration(seconds=60))
+    # It leaves while most of them wait to be decoded.
+    monitor.status("capture_node", lambda status, values: int(values["received"]) > 0)
+    node.destroy_publisher(camera)
+    monitor.status("capture_node", lambda status, values: int(values["received"]) == BURST)
