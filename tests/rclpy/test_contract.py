@@ -172,7 +172,7 @@ def solved(launcher, ros, generate):
     settings of the solver."""
     launcher.cell(*SCALE)
     arm = Arm(ros)
-    Camera(ros).show_puzzle(generate(2, 3, 5, "--similarity", "0.98", "--noise", "8", "--blur", "2"))
+    Camera(ros).show_puzzle(generate(2, 3, 2, "--similarity", "0.98", "--noise", "8", "--blur", "2"))
     arm.complete(6)
     return arm, Settings(ros, "solver_node")
 
