@@ -18,7 +18,7 @@ use jigsaw_nodes::bag::{BagReader, BagWriter, QosProfile, Selection, Storage, To
 use jigsaw_nodes::capture::convert::{FrameHead, picture, piece_message};
 use jigsaw_nodes::capture::cut::Pixels;
 use jigsaw_nodes::capture::source::Frame;
-use jigsaw_nodes::ros::args::RosArgs;
+use jigsaw_nodes::ros::arguments::RosArgs;
 use jigsaw_nodes::ros::node_params::COMMON_PARAMETERS;
 use jigsaw_nodes::ros::params::Parameters;
 use jigsaw_nodes::{capture, feature, solver};

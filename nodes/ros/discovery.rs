@@ -16,7 +16,7 @@ use rustdds::dds::statusevents::{DomainParticipantStatusEvent, LostReason, Statu
 use rustdds::policy::{Durability, Reliability};
 use rustdds::{DomainParticipant, GUID, QosPolicies, RTPSEntity};
 
-use super::missed;
+use super::mends::missed;
 
 /// Most participants that are remembered as forgotten; beyond, those that have been away longest are not expected back.
 const MOST_FORGOTTEN: usize = 1024;

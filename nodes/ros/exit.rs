@@ -9,7 +9,7 @@
 
 use std::process::ExitCode;
 
-use super::args::ArgsError;
+use super::arguments::ArgsError;
 use super::discovery::Estranged;
 use super::params::ParameterError;
 use super::session::SessionError;

@@ -14,8 +14,8 @@ use ros2_client::builtin_interfaces::Time;
 use ros2_client::ros2::LogLevel;
 use ros2_client::{NodeLoggingHandle, RosoutRaw};
 
-use super::args::RosArgs;
-use super::names::NodeNames;
+use super::arguments::RosArgs;
+use super::arguments::names::NodeNames;
 
 const NANOS: i64 = 1_000_000_000;
 

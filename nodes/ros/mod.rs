@@ -8,16 +8,11 @@
 //! | **a process** | |
 //! | [`process`] | one process: signals, nodes, end |
 //! | `participant` | how it joins its domain and leaves it: interfaces, static peers, security |
-//! | `turn` | the processes of a host join a domain one after the other |
 //! | `security` | keystore and enclave of SROS2 |
-//! | [`peers`] | discovery without multicast |
-//! | `farewell` | says that a process leaves |
 //! | `watchdog` | a process that has gone deaf, or whose loop stands still |
 //! | [`exit`] | why a process ends, and its exit code |
 //! | **what it is told** | |
-//! | [`args`] | the command line of ROS |
-//! | [`names`] | names of nodes, topics and services, and what remaps them |
-//! | [`assignments`] | values given to parameters on the command line and in files |
+//! | [`arguments`] | the command line of ROS; in it names and what remaps them, and values given to parameters there and in files |
 //! | [`params`] | declaration, check and documentation of parameters |
 //! | [`node_params`] | the parameters that every node has |
 //! | **a node** | |
@@ -30,34 +25,29 @@
 //! | [`logging`] | log lines to the console and `/rosout`, throttled warnings |
 //! | **what a node can do beside** | |
 //! | `server` | one service: requests in, answers out |
-//! | `large` | answers that do not fit a datagram |
-//! | `missed` | asks a client's writer for the request that came before it was known |
 //! | [`services`] | the six parameter services |
 //! | [`lifecycle`] | states and transitions of a managed node |
 //! | [`actions`] | goals as a stream |
 //! | [`kept`] | latched pieces, and which of them are forgotten |
 //! | [`raw`] | topics whose type is known by name only |
 //! | [`transforms`] | pixels (y down) to metres (y up) |
+//! | **what RustDDS leaves undone** | |
+//! | [`mends`] | done beside it, each to be deleted when it is mended there |
 
 pub mod actions;
 pub mod activity;
-pub mod args;
-pub mod assignments;
+pub mod arguments;
 pub mod clock;
 pub mod discovery;
 pub mod exit;
-mod farewell;
 pub mod health;
 pub mod kept;
-mod large;
 pub mod lifecycle;
 pub mod logging;
-mod missed;
-pub mod names;
+pub mod mends;
 pub mod node_params;
 pub mod params;
 mod participant;
-pub mod peers;
 pub mod process;
 pub mod raw;
 mod security;
@@ -66,5 +56,4 @@ pub mod services;
 pub mod session;
 pub mod topics;
 pub mod transforms;
-mod turn;
 mod watchdog;

@@ -10,7 +10,7 @@ use futures::channel::mpsc;
 use ros2_client::ParameterValue;
 use ros2_client::parameters::raw;
 
-use super::assignments::Override;
+use super::arguments::assignments::Override;
 
 /// Default value of a parameter; its variant is the type.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -551,7 +551,8 @@ mod tests {
         std::fs::create_dir_all(&folder).unwrap();
         let file = folder.join("n.param.yaml");
         std::fs::write(&file, yaml("n", &[TABLE])).unwrap();
-        let args = super::super::args::RosArgs::parse(["--ros-args", "--params-file", file.to_str().unwrap()]).unwrap();
+        let args =
+            super::super::arguments::RosArgs::parse(["--ros-args", "--params-file", file.to_str().unwrap()]).unwrap();
         let overrides = args.overrides(&args.node("/any", "n").unwrap());
         assert_eq!(overrides.len(), TABLE.len());
         let parameters = Parameters::declare("n", &[TABLE]);

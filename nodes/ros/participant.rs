@@ -1,7 +1,7 @@
 //! The DDS participant of a process: how it joins its domain, and leaves it.
 //!
 //! All nodes of a process share one. It is opened on the interfaces and for the hosts that parameters or environment name,
-//! secured where the environment says so, in its [turn](super::turn), and says [farewell](super::farewell) when it has gone.
+//! secured where the environment says so, in its [turn](super::mends::turn), and says [farewell](super::mends::farewell) when it has gone.
 
 use std::net::{IpAddr, Ipv4Addr};
 use std::sync::mpsc::{self, RecvTimeoutError};
@@ -10,16 +10,16 @@ use std::time::Duration;
 use ros2_client::Context;
 use rustdds::{DomainParticipant, DomainParticipantBuilder, RTPSEntity};
 
-use super::args::ArgsError;
+use super::arguments::ArgsError;
 use super::discovery::Endpoints;
 use super::exit::ProcessError;
-use super::farewell::Farewell;
+use super::mends::farewell::Farewell;
+use super::mends::peers::Courier;
+use super::mends::turn::Turn;
 use super::node_params::{NETWORK_INTERFACES, STATIC_PEERS};
 use super::params::Parameters;
-use super::peers::Courier;
 use super::security;
 use super::session::SessionError;
-use super::turn::Turn;
 
 /// How long the middleware may take to end; what it has not done by then is left to the end of the process.
 const MIDDLEWARE_PATIENCE: Duration = Duration::from_secs(5);

@@ -22,7 +22,7 @@ use nix::sys::signal::{SigSet, Signal};
 use ros2_client::{Context, NodeName, NodeOptions};
 
 use super::activity::Activity;
-use super::args::RosArgs;
+use super::arguments::RosArgs;
 use super::clock::Clock;
 use super::discovery::{self, Endpoints};
 use super::exit::{ProcessError, exit_code, told};

@@ -13,7 +13,7 @@ use std::path::{Path, PathBuf};
 
 use rustdds::DomainParticipantBuilder;
 
-use super::args::ArgsError;
+use super::arguments::ArgsError;
 
 /// The files of an enclave, as SROS2 names them.
 const FILES: [&str; 6] =

@@ -25,7 +25,7 @@ use serde::Serialize;
 use serde::de::DeserializeOwned;
 
 use super::health::Health;
-use super::large;
+use super::mends::large;
 use super::session::{CHANNEL_DEPTH, Call, Session, SessionError};
 use super::topics::SERVICE_QOS;
 

@@ -16,10 +16,10 @@ use ros2_client::{Context, MessageInfo, MessageTypeName, Node, QosProfile, Subsc
 use rustdds::{GUID, RTPSEntity};
 
 use super::activity::Activity;
+use super::arguments::names::{NameError, NodeNames};
 use super::clock::Clock;
 use super::discovery::{Audience, Endpoints, LesserWriter, Offer};
 use super::health::Health;
-use super::names::{NameError, NodeNames};
 use super::params::Parameters;
 use super::topics::{TOPIC_PREFIX, Topic};
 

@@ -15,7 +15,7 @@ use jigsaw_msgs::diagnostic_msgs::msg::DiagnosticArray;
 use jigsaw_msgs::geometry_msgs::msg::Pose;
 use jigsaw_msgs::msg::Assembly;
 use jigsaw_msgs::tf2_msgs::msg::TFMessage;
-use jigsaw_nodes::ros::peers::Courier;
+use jigsaw_nodes::ros::mends::peers::Courier;
 use jigsaw_nodes::ros::topics::{self, Topic};
 use jigsaw_nodes::ros::transforms::PixelPlane;
 use nalgebra::{Isometry2, Point2, Vector2};

@@ -23,7 +23,7 @@ use rustdds::GUID;
 use socket2::{Domain, Protocol, Socket, Type};
 
 /// Where participants announce themselves (RTPS 9.6.1.4.1).
-pub(super) const DISCOVERY_GROUP: Ipv4Addr = Ipv4Addr::new(239, 255, 0, 1);
+pub(crate) const DISCOVERY_GROUP: Ipv4Addr = Ipv4Addr::new(239, 255, 0, 1);
 
 /// Ports of the RTPS specification (9.6.1.1): base, gain of the domain, offsets of user multicast and of discovery
 /// unicast, gain of the participant.
@@ -76,12 +76,12 @@ const PARTICIPANT_DETECTOR: u32 = 1 << 1;
 const LOCATOR_ADDRESS: std::ops::Range<usize> = 20..24;
 
 /// The port of [`DISCOVERY_GROUP`] in a domain.
-pub(super) fn discovery_multicast(domain: u16) -> u16 {
+pub(crate) fn discovery_multicast(domain: u16) -> u16 {
     PORT_BASE + DOMAIN_GAIN * domain
 }
 
 /// The ports on which the first participants of a host listen to discovery in a domain.
-pub(super) fn discovery_unicast(domain: u16) -> impl Iterator<Item = u16> + Clone {
+pub(crate) fn discovery_unicast(domain: u16) -> impl Iterator<Item = u16> + Clone {
     let first = PORT_BASE + DOMAIN_GAIN * domain + UNICAST_OFFSET;
     (0..PARTICIPANTS).map(move |k| first + PARTICIPANT_GAIN * k)
 }
@@ -248,7 +248,7 @@ fn announcement_for_peers(body: &[u8]) -> Option<Vec<u8>> {
 }
 
 /// The IPv4 addresses among these, or those of all interfaces.
-pub(super) fn multicast_addresses(given: &[IpAddr]) -> Vec<Ipv4Addr> {
+pub(crate) fn multicast_addresses(given: &[IpAddr]) -> Vec<Ipv4Addr> {
     if !given.is_empty() {
         return given.iter().filter_map(|a| if let IpAddr::V4(a) = a { Some(*a) } else { None }).collect();
     }

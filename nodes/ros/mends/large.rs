@@ -18,7 +18,7 @@ use rustdds::discovery::ReaderProxy;
 use rustdds::{DomainParticipant, GUID, SampleIdentity};
 
 /// Bytes of an answer that every datagram holds beside all that goes with it.
-pub(super) const FRAGMENT: u16 = 1024;
+pub(crate) const FRAGMENT: u16 = 1024;
 
 /// What an interface carries, in bytes, that tells nothing of it, or none on the way: an Ethernet frame.
 const USUAL_MTU: usize = 1500;
@@ -36,7 +36,7 @@ const PAUSES: [Duration; 3] = [Duration::ZERO, Duration::from_millis(50), Durati
 const RELATED: [u16; 2] = [0x0083, 0x800f];
 
 /// Sends an answer that RustDDS fragments to the readers of the client, several times, from a thread beside.
-pub(super) fn send(participant: &DomainParticipant, answer: SampleIdentity, request: SampleIdentity, content: Vec<u8>) {
+pub(crate) fn send(participant: &DomainParticipant, answer: SampleIdentity, request: SampleIdentity, content: Vec<u8>) {
     let known = participant.discovered_readers();
     let addresses = |reader: &ReaderProxy| -> Vec<SocketAddr> {
         reader.unicast_locator_list.iter().filter(|l| l.is_udp()).map(|l| SocketAddr::from(*l)).collect()

@@ -18,8 +18,11 @@ use std::path::PathBuf;
 
 use log::LevelFilter;
 
-use super::assignments::{Assignment, Override, parse_file};
-use super::names::{NameError, NodeNames, Remap};
+pub mod assignments;
+pub mod names;
+
+use assignments::{Assignment, Override, parse_file};
+use names::{NameError, NodeNames, Remap};
 
 /// Why a command line was not understood. Every message names the argument and the rule it breaks.
 #[derive(Debug, thiserror::Error)]
@@ -101,13 +104,13 @@ impl RosArgs {
     /// Parses the arguments of a program, its own name not among them. Parameter files are read.
     ///
     /// ```
-    /// use jigsaw_nodes::ros::args::RosArgs;
+    /// use jigsaw_nodes::ros::arguments::RosArgs;
     /// let args = RosArgs::parse(["--ros-args", "-r", "__ns:=/cell", "-r", "image:=/camera/image", "-p", "k:=2"])?;
     /// let names = args.node("/", "capture_node")?;
     /// assert_eq!(names.full_name(), "/cell/capture_node");
     /// assert_eq!(names.topic("image")?, "/camera/image");
     /// assert_eq!(names.topic("pieces/image")?, "/cell/pieces/image");
-    /// # Ok::<(), jigsaw_nodes::ros::args::ArgsError>(())
+    /// # Ok::<(), jigsaw_nodes::ros::arguments::ArgsError>(())
     /// ```
     ///
     /// # Errors

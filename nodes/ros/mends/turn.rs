@@ -25,7 +25,7 @@ const ECHO: Duration = Duration::from_millis(100);
 /// stopped.
 const PATIENCE: Duration = Duration::from_secs(3);
 
-/// The same where processes are secured; less than a loop may stand still ([`super::watchdog`]).
+/// The same where processes are secured; less than a loop may stand still (`watchdog`).
 const SECURED_PATIENCE: Duration = Duration::from_secs(20);
 
 /// How long a secured process waits to be met: by then the others have heard its announcement and answered with theirs, on a
@@ -40,14 +40,14 @@ const LOOK: Duration = Duration::from_millis(5);
 
 /// The turn of this process among those of its host in its domain; given back when this is dropped.
 #[derive(Debug)]
-pub(super) struct Turn {
+pub(crate) struct Turn {
     lock: Option<File>,
 }
 
 impl Turn {
     /// Waits for the turn. Where it does not come, or the system knows no such lock, there is none, and nothing is lost
     /// but certainty.
-    pub(super) fn take(domain: u16, secured: bool) -> Self {
+    pub(crate) fn take(domain: u16, secured: bool) -> Self {
         let path = std::env::temp_dir().join(format!("jigsaw_cell_domain_{domain}.turn"));
         // A file of another user can be locked as well; it need only be readable.
         let file = File::open(&path).or_else(|_| OpenOptions::new().append(true).create(true).open(&path));
@@ -70,7 +70,7 @@ impl Turn {
 
     /// To be called when the endpoints are open: gives the turn back when others may join. `handshakes` tells, where the process
     /// is secured, with how many participants it is shaking hands.
-    pub(super) async fn done(self, handshakes: Option<impl Fn() -> usize>) {
+    pub(crate) async fn done(self, handshakes: Option<impl Fn() -> usize>) {
         if self.lock.is_none() {
             return;
         }
@@ -89,8 +89,8 @@ impl Turn {
 mod tests {
     use std::cell::Cell;
 
-    use super::super::watchdog;
     use super::*;
+    use crate::ros::watchdog;
 
     /// Domains that no test runs a node in.
     const DOMAIN: u16 = 231;

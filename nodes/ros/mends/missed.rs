@@ -21,7 +21,7 @@ const PREFIX: usize = 12;
 ///
 /// # Errors
 /// The system's.
-pub(super) fn ask(participant: &DomainParticipant, reader: GUID, writer: GUID) -> std::io::Result<()> {
+pub(crate) fn ask(participant: &DomainParticipant, reader: GUID, writer: GUID) -> std::io::Result<()> {
     if !writer.to_bytes().starts_with(&FAST_DDS) || reader.prefix != participant.guid().prefix {
         return Ok(());
     }

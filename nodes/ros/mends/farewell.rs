@@ -19,7 +19,7 @@ const LAST: u32 = i32::MAX as u32;
 
 /// What it takes to say farewell when the participant is no more.
 #[derive(Debug)]
-pub(super) struct Farewell {
+pub(crate) struct Farewell {
     message: Vec<u8>,
     domain: u16,
     interfaces: Vec<IpAddr>,
@@ -28,7 +28,7 @@ pub(super) struct Farewell {
 
 impl Farewell {
     /// Of this participant, on these interfaces (all if there are none) and to these peers.
-    pub(super) fn of(participant: GUID, domain: u16, interfaces: Vec<IpAddr>, peers: Vec<Ipv4Addr>) -> Self {
+    pub(crate) fn of(participant: GUID, domain: u16, interfaces: Vec<IpAddr>, peers: Vec<Ipv4Addr>) -> Self {
         Self { message: message(&participant.to_bytes()), domain, interfaces, peers }
     }
 
@@ -36,7 +36,7 @@ impl Farewell {
     ///
     /// # Errors
     /// The system's, where there is no socket to be had.
-    pub(super) fn say(&self) -> std::io::Result<()> {
+    pub(crate) fn say(&self) -> std::io::Result<()> {
         let socket = Socket::new(Domain::IPV4, Type::DGRAM, Some(Protocol::UDP))?;
         let group = peers::discovery_multicast(self.domain);
         for interface in peers::multicast_addresses(&self.interfaces) {
