@@ -19,6 +19,8 @@ import rclpy
 from jigsaw_msgs.msg import Assembly
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState
+from rclpy.exceptions import InvalidParameterTypeException
+from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
 from rclpy.qos import QoSDurabilityPolicy, QoSProfile, QoSReliabilityPolicy
 
@@ -86,7 +88,18 @@ def in_order(assembly):
         yield left.pop(near)
 
 
-if __name__ == "__main__":
+def main():
+    """Runs the node until all is told, or it is interrupted."""
     rclpy.init()
-    Arm().run()
-    rclpy.shutdown()
+    try:
+        Arm().run()
+    except InvalidParameterTypeException as refusal:
+        raise SystemExit(f"arm: {refusal}") from None
+    except (KeyboardInterrupt, ExternalShutdownException):
+        pass
+    finally:
+        rclpy.try_shutdown()
+
+
+if __name__ == "__main__":
+    main()
