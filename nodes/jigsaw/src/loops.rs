@@ -106,13 +106,16 @@ struct Way {
     via: Option<usize>,
     pose: Isometry2<f64>,
     edges: [usize; 2],
+    /// The isthmuses by which it leaves the piece from which it starts, and by which it arrives.
+    ends: [Slot; 2],
 }
 
 impl Way {
     /// This step, and one more from where it leads.
     fn then(&self, second: &Self) -> Self {
         let edges = [self.edges[0], second.edges[0]];
-        Self { to: second.to, via: Some(self.to), pose: self.pose * second.pose, edges }
+        let ends = [self.ends[0], second.ends[1]];
+        Self { to: second.to, via: Some(self.to), pose: self.pose * second.pose, edges, ends }
     }
 }
 
@@ -219,9 +222,10 @@ impl<'a> Ways<'a> {
         let mut steps: Vec<Vec<Way>> = counts.into_iter().map(Vec::with_capacity).collect();
         for &k in active {
             let e = &edges[k];
-            let way = |to, pose| Way { to, via: None, pose, edges: [k, k] };
-            steps[e.b].push(way(e.a, e.b_from_a));
-            steps[e.a].push(way(e.b, e.b_from_a.inverse()));
+            let [tab, mouth] = e.slots;
+            let way = |to, pose, ends| Way { to, via: None, pose, edges: [k, k], ends };
+            steps[e.b].push(way(e.a, e.b_from_a, [mouth, tab]));
+            steps[e.a].push(way(e.b, e.b_from_a.inverse(), [tab, mouth]));
         }
         Self { edges, outlines, slots, tolerance, steps }
     }
@@ -265,9 +269,8 @@ impl<'a> Ways<'a> {
             Vec::with_capacity(steps.clone().map(|w| 1 + self.steps[w.to].len()).sum());
         for first in steps {
             long.push((first.to, first, None));
-            let arrives = self.arrives(first);
             let onwards = self.steps[first.to].iter().filter(|w| w.to > a && w.to != first.to);
-            let free = onwards.filter(|second| !self.slots.conflict(arrives, self.leaves(first.to, second)));
+            let free = onwards.filter(|second| !self.slots.conflict(first.ends[1], second.ends[0]));
             long.extend(free.map(|second| (second.to, first, Some(second))));
         }
         long.iter().for_each(|(to, ..)| leading[*to] += 1);
@@ -288,17 +291,6 @@ impl<'a> Ways<'a> {
 
     fn place(&self, way: &Way) -> Place {
         Place { to: way.to, x: (way.pose * self.outlines[way.to].centroid).x }
-    }
-
-    /// The isthmus by which a way leaves the piece from which it starts, and the one by which it arrives.
-    fn leaves(&self, from: usize, way: &Way) -> Slot {
-        let [tab, mouth] = self.edges[way.edges[0]].slots;
-        if tab.piece == from { tab } else { mouth }
-    }
-
-    fn arrives(&self, way: &Way) -> Slot {
-        let [tab, mouth] = self.edges[way.edges[1]].slots;
-        if tab.piece == way.to { tab } else { mouth }
     }
 
     /// How far apart the places of two ways to a piece may be.
@@ -386,9 +378,7 @@ impl<'a> Ways<'a> {
         if !self.tolerance.allows(outline, &p.pose, &q.pose) {
             return None;
         }
-        if self.slots.conflict(self.leaves(a, p), self.leaves(a, q))
-            || self.slots.conflict(self.arrives(p), self.arrives(q))
-        {
+        if (0..2).any(|end| self.slots.conflict(p.ends[end], q.ends[end])) {
             return None;
         }
         let edges = if triangle {

@@ -9,14 +9,14 @@ use crate::outline::{Outline, Segment};
 use crate::placement;
 
 /// A tab that may fit a mouth.
-#[derive(Debug, Clone, Copy)]
+#[derive(Debug, Clone)]
 pub(crate) struct Match {
     pub(crate) hit: Hit,
     /// `None` where not even a rough pose was found.
     rough: Option<placement::Rough>,
-    /// Coarse fit, of the roughly best only, and refined fit, of the best of these.
-    coarse: Option<placement::Fit>,
-    fine: Option<placement::Fit>,
+    /// Coarse fit, of the roughly best only, and refined fit, of the best of these: of few, so that lists stay short in memory.
+    coarse: Option<Box<placement::Fit>>,
+    fine: Option<Box<placement::Fit>>,
 }
 
 /// The tabs that resemble a mouth most.
@@ -24,8 +24,8 @@ pub(crate) struct Match {
 pub(crate) struct List {
     /// Nearest first.
     pub(crate) matches: Vec<Match>,
-    /// Place and fit of those that were good enough to be refined; none where they have to be chosen.
-    pub(crate) fits: Option<Vec<(usize, placement::Fit)>>,
+    /// Those that were good enough to be refined; none where they have to be chosen.
+    pub(crate) fits: Option<Vec<(Hit, placement::Fit)>>,
 }
 
 impl List {
@@ -65,9 +65,10 @@ const COARSELY: (f64, f64) = (1.5, 0.001);
 
 /// Those of some places in a mouth's list whose residual is within `near` of the least, but at least [`REFINED`]; best
 /// first.
-fn best(list: &[Match], residuals: impl Iterator<Item = (f64, usize)>, near: (f64, f64), scale: f64) -> Vec<usize> {
+fn best(residuals: impl Iterator<Item = (f64, usize)>, near: (f64, f64), scale: f64) -> Vec<usize> {
     let mut places: Vec<(f64, usize)> = residuals.collect();
-    places.sort_by(|p, q| p.0.total_cmp(&q.0).then(list[p.1].hit.order(&list[q.1].hit)));
+    // Of equals the nearest, as in the list.
+    places.sort_by(|p, q| p.0.total_cmp(&q.0).then(p.1.cmp(&q.1)));
     let limit = places.first().map_or(0.0, |p| near.0 * p.0 + near.1 * scale);
     let within = places.partition_point(|p| p.0 <= limit);
     places.truncate(within.max(REFINED));
@@ -77,16 +78,16 @@ fn best(list: &[Match], residuals: impl Iterator<Item = (f64, usize)>, near: (f6
 /// Places in a mouth's list of the candidates to fit coarsely.
 fn roughly_best(list: &[Match], scale: f64) -> Vec<usize> {
     let residuals = list.iter().enumerate().filter_map(|(k, m)| Some((m.rough?.residual, k)));
-    best(list, residuals, ROUGHLY, scale)
+    best(residuals, ROUGHLY, scale)
 }
 
 /// Those of them to refine.
 fn coarsely_best(list: &[Match], places: &[usize], scale: f64) -> Vec<usize> {
-    let residuals = places.iter().filter_map(|k| Some((list[*k].coarse?.residual, *k)));
-    best(list, residuals, COARSELY, scale)
+    let residuals = places.iter().filter_map(|k| Some((list[*k].coarse.as_ref()?.residual, *k)));
+    best(residuals, COARSELY, scale)
 }
 
-/// Fits what has to be fitted in a mouth's list and isn't yet, and gives the places and fits that stand: refined where
+/// Fits what has to be fitted in a mouth's list and isn't yet, and gives the fits that stand: refined where
 /// the coarse one is good enough. Which these are depends on the list alone, not on what was fitted while it was another.
 pub(crate) fn refine(
     list: &mut [Match],
@@ -94,13 +95,13 @@ pub(crate) fn refine(
     outlines: &[&Outline],
     (scale, free): (f64, bool),
     feet: &mut placement::Feet,
-) -> Vec<(usize, placement::Fit)> {
+) -> Vec<(Hit, placement::Fit)> {
     let tab = |m: &Match| &outlines[m.hit.piece as usize].tabs[m.hit.tab as usize];
     let places = roughly_best(list, scale);
     for &place in &places {
         let m = &mut list[place];
         if let (Some(rough), None) = (&m.rough, &m.coarse) {
-            m.coarse = placement::coarse(tab(m), mouth, rough, scale, free, feet);
+            m.coarse = placement::coarse(tab(m), mouth, rough, scale, free, feet).map(Box::new);
         }
     }
     let fine = coarsely_best(list, &places, scale);
@@ -108,9 +109,9 @@ pub(crate) fn refine(
         let m = &mut list[place];
         if let (Some(coarse), None) = (&m.coarse, &m.fine) {
             let from = (&coarse.negative_from_positive, coarse.clearance);
-            m.fine = placement::refine(tab(m), mouth, from, scale, free, feet);
+            m.fine = placement::refine(tab(m), mouth, from, scale, free, feet).map(Box::new);
         }
     }
-    let fit = |k: usize| if fine.contains(&k) { list[k].fine } else { list[k].coarse };
-    places.into_iter().filter_map(|k| Some((k, fit(k)?))).collect()
+    let fit = |k: usize| if fine.contains(&k) { list[k].fine.as_deref() } else { list[k].coarse.as_deref() };
+    places.into_iter().filter_map(|k| Some((list[k].hit, *fit(k)?))).collect()
 }

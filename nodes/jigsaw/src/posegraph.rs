@@ -6,6 +6,7 @@
 //! (Tinney and Walker 1967; about O(n log n) of fill on the planar graph of a puzzle). The first node of each connected part
 //! stays where it is.
 
+use isthmus::wide::widely;
 use nalgebra::{Matrix3, Point2, UnitComplex, Vector2, Vector3};
 
 /// A contact: the motion `d` of node `a` relative to node `b` at `centre` costs `½ dᵀ hessian d + gradientᵀ d`.
@@ -156,7 +157,25 @@ impl Plan {
             pivots[self.place[root]] += Matrix3::identity() * (1e6 * weight.max(1.0));
         }
         let damping = Matrix3::identity() * (1e-9 * weight.max(1e-9));
-        for k in 0..n {
+        widely!(self.eliminate(damping, &mut pivots, &mut right, &mut blocks));
+        let mut motion = vec![Vector3::zeros(); n];
+        for k in (0..n).rev() {
+            let known = row(k).map(|at| blocks[at] * motion[self.order[self.columns[at]]]);
+            motion[self.order[k]] = pivots[k] * known.fold(right[k], |sum, known| sum - known);
+        }
+        motion
+    }
+
+    #[inline(always)]
+    fn eliminate(
+        &self,
+        damping: Matrix3<f64>,
+        pivots: &mut [Matrix3<f64>],
+        right: &mut [Vector3<f64>],
+        blocks: &mut [Matrix3<f64>],
+    ) {
+        let row = |k: usize| self.starts[k]..self.starts[k + 1];
+        for k in 0..self.order.len() {
             let inverse = (pivots[k] + damping).try_inverse().unwrap_or_default();
             pivots[k] = inverse;
             let pivot_right = right[k];
@@ -175,12 +194,6 @@ impl Plan {
                 }
             }
         }
-        let mut motion = vec![Vector3::zeros(); n];
-        for k in (0..n).rev() {
-            let known = row(k).map(|at| blocks[at] * motion[self.order[self.columns[at]]]);
-            motion[self.order[k]] = pivots[k] * known.fold(right[k], |sum, known| sum - known);
-        }
-        motion
     }
 }
 

@@ -86,6 +86,8 @@ struct Assembler<'a> {
     usual: f64,
     /// Candidates at each piece.
     at: Vec<Vec<usize>>,
+    /// What the best two candidates of each isthmus cost.
+    best: Vec<[f64; 2]>,
     scale: f64,
     prior: ClearancePrior,
     /// Whether the clearance is known from this puzzle.
@@ -123,9 +125,9 @@ pub(crate) fn assemble(
     let scale = *scales.select_nth_unstable_by(n / 2, f64::total_cmp).1;
     let slots = Slots::new(outlines);
     let mut edges: Vec<Edge> = joints.iter().map(|j| edge(j, outlines, &slots, 1.0)).collect();
-    rank(&mut edges, &slots);
-    let best = (0..edges.len()).filter(|k| edges[*k].mouth_rank == 0);
-    let usual = learn::median(&mut best.map(|k| joints[k].fit.residual).collect::<Vec<f64>>()).unwrap_or(1.0);
+    let best = rank(&mut edges, &slots);
+    let first = (0..edges.len()).filter(|k| edges[*k].mouth_rank == 0);
+    let usual = learn::median(&mut first.map(|k| joints[k].fit.residual).collect::<Vec<f64>>()).unwrap_or(1.0);
     edges.iter_mut().zip(&joints).for_each(|(e, j)| e.variance = variance(j.fit.residual, usual));
     let mut at = vec![Vec::new(); n];
     for (k, e) in edges.iter().enumerate() {
@@ -144,6 +146,7 @@ pub(crate) fn assemble(
         edges,
         contacts: 0,
         at,
+        best,
         scale,
         prior: ClearancePrior { mean: 0.0, deviation: 0.01 * scale, noise: noise.max(0.02) },
         calibrated: false,

@@ -16,67 +16,70 @@ pub(crate) struct Slot {
 /// All isthmuses; those of a piece follow one another, tabs first.
 #[derive(Debug, Clone)]
 pub(crate) struct Slots<'a> {
-    outlines: &'a [&'a Outline],
-    /// Number of the first isthmus of each piece, and how many there are in all.
-    first: Vec<usize>,
-    /// By number: itself and its rivals.
-    rivals: Vec<Vec<Slot>>,
+    /// Number of the first tab and of the first mouth of each piece, and behind them how many isthmuses there are in all.
+    first: Vec<[usize; 2]>,
+    /// By number.
+    segments: Vec<&'a Segment>,
+    /// Of each number where its list begins: itself and its rivals.
+    starts: Vec<usize>,
+    rivals: Vec<Slot>,
 }
 
 impl<'a> Slots<'a> {
     pub(crate) fn new(outlines: &'a [&'a Outline]) -> Self {
-        let mut first = vec![0];
-        let mut rivals = Vec::new();
+        let count = outlines.iter().map(|o| o.tabs.len() + o.mouths.len()).sum();
+        let (mut first, mut starts) = (Vec::with_capacity(outlines.len() + 1), Vec::with_capacity(count + 1));
+        let (mut segments, mut rivals) = (Vec::with_capacity(count), Vec::with_capacity(count));
         for (piece, o) in outlines.iter().enumerate() {
-            let begin = rivals.len();
-            let segments: Vec<&Segment> = o.tabs.iter().chain(&o.mouths).collect();
-            let slot = |k: usize| Slot { piece, number: begin + k };
-            rivals.extend(segments.iter().enumerate().map(|(i, p)| {
-                let near = segments.iter().enumerate().filter(|(j, q)| i == *j || share(o.length, p, q));
-                near.map(|(j, _)| slot(j)).collect::<Vec<Slot>>()
-            }));
-            first.push(rivals.len());
+            let begin = segments.len();
+            first.push([begin, begin + o.tabs.len()]);
+            segments.extend(o.tabs.iter().chain(&o.mouths));
+            for (i, p) in segments[begin..].iter().enumerate() {
+                starts.push(rivals.len());
+                let near = segments[begin..].iter().enumerate().filter(|(j, q)| i == *j || share(o.length, p, q));
+                rivals.extend(near.map(|(j, _)| Slot { piece, number: begin + j }));
+            }
         }
-        Self { outlines, first, rivals }
+        first.push([count; 2]);
+        starts.push(rivals.len());
+        Self { first, segments, starts, rivals }
     }
 
     /// How many there are.
     pub(crate) fn count(&self) -> usize {
-        self.rivals.len()
+        self.segments.len()
     }
 
     /// The tab at some position of a piece's tabs.
     pub(crate) fn tab(&self, piece: usize, index: usize) -> Slot {
-        Slot { piece, number: self.first[piece] + index }
+        Slot { piece, number: self.first[piece][0] + index }
     }
 
     /// The mouth at some position of a piece's mouths.
     pub(crate) fn mouth(&self, piece: usize, index: usize) -> Slot {
-        Slot { piece, number: self.first[piece] + self.outlines[piece].tabs.len() + index }
+        Slot { piece, number: self.first[piece][1] + index }
     }
 
     /// All tabs, or all mouths, of a piece.
-    pub(crate) fn of(&self, piece: usize, tabs: bool) -> impl Iterator<Item = Slot> {
-        let middle = self.first[piece] + self.outlines[piece].tabs.len();
-        let range = if tabs { self.first[piece]..middle } else { middle..self.first[piece + 1] };
+    pub(crate) fn of(&self, piece: usize, tabs: bool) -> impl ExactSizeIterator<Item = Slot> + use<> {
+        let [first, middle] = self.first[piece];
+        let range = if tabs { first..middle } else { middle..self.first[piece + 1][0] };
         range.map(move |number| Slot { piece, number })
     }
 
     /// Whether it is a tab.
     pub(crate) fn is_tab(&self, slot: Slot) -> bool {
-        slot.number - self.first[slot.piece] < self.outlines[slot.piece].tabs.len()
+        slot.number < self.first[slot.piece][1]
     }
 
     /// Its match segment.
     pub(crate) fn segment(&self, slot: Slot) -> &'a Segment {
-        let outline = self.outlines[slot.piece];
-        let index = slot.number - self.first[slot.piece];
-        outline.tabs.get(index).unwrap_or_else(|| &outline.mouths[index - outline.tabs.len()])
+        self.segments[slot.number]
     }
 
     /// The isthmuses that can't mate if this one does, itself among them.
     pub(crate) fn rivals(&self, slot: Slot) -> &[Slot] {
-        &self.rivals[slot.number]
+        &self.rivals[self.starts[slot.number]..self.starts[slot.number + 1]]
     }
 
     /// Whether two isthmuses are the same one or rivals.

@@ -1,7 +1,7 @@
 //! The incremental solver: pieces come and go, candidates are kept, a solution is made on demand.
 
 use crate::correlation::correlate;
-use crate::index::{Entry, Index, Windows, shape_distance};
+use crate::index::{Entry, Hit, Index, Windows, shape_distance};
 use crate::matching::{List, Match};
 use crate::memory::Memory;
 use crate::outline::{Outline, Segment};
@@ -245,8 +245,9 @@ impl Solver {
                     kept.current = false;
                     list.fits = None;
                 }
-                for m in list.matches.iter_mut().filter(|m| m.hit.piece as usize > index) {
-                    m.hit.piece -= 1;
+                let fits = list.fits.iter_mut().flatten().map(|(hit, _)| hit);
+                for hit in list.matches.iter_mut().map(|m| &mut m.hit).chain(fits) {
+                    hit.piece -= u32::from(hit.piece as usize > index);
                 }
             }
         }
@@ -303,7 +304,14 @@ impl Solver {
         let matched = Instant::now();
         self.memory.next_solution();
         let outlines = ranked(&self.kept, &order);
-        let outcome = search::assemble(&outlines, joints, &self.params, &self.memory, budget);
+        // What is only counted is counted meanwhile.
+        let (outcome, passed) = rayon::join(
+            || search::assemble(&outlines, joints, &self.params, &self.memory, budget),
+            || (self.params.policy == Policy::Standard).then(|| within_windows(&outlines)),
+        );
+        if let Some(passed) = passed {
+            (table.after_opening, table.after_length) = passed;
+        }
         self.count_brought_up(&mut table, &order, &outlines, &outcome);
         let mut assembly = report(&order, &outlines, &outcome, &self.memory);
         assembly.table = TableCounts { backtracks: outcome.backtracks, ..table };
@@ -356,12 +364,15 @@ impl Solver {
             lists.resize(outline.mouths.len(), List::default());
             for (mouth, list) in outline.mouths.iter().zip(lists) {
                 let matches = &mut list.matches;
-                // Ranks shift with each new id.
-                matches.iter_mut().for_each(|m| m.hit.rank = rank[m.hit.piece as usize] as u32);
                 for hit in index.nearest(mouth, piece as u32, &Windows::of(outline), most) {
-                    let place = matches.partition_point(|m: &Match| m.hit.order(&hit).is_lt());
-                    let known = matches.get(place).is_some_and(|m| (m.hit.piece, m.hit.tab) == (hit.piece, hit.tab));
-                    if place >= most || known {
+                    // Ranks shift with each new id.
+                    let before =
+                        |m: &Match| Hit { rank: rank[m.hit.piece as usize] as u32, ..m.hit }.order(&hit).is_lt();
+                    if matches.get(most - 1).is_some_and(before) {
+                        break;
+                    }
+                    let place = matches.partition_point(before);
+                    if matches.get(place).is_some_and(|m| (m.hit.piece, m.hit.tab) == (hit.piece, hit.tab)) {
                         continue;
                     }
                     matches.insert(place, Match::new(hit, mouth, &outlines, (outline.scale, free), feet));
@@ -382,13 +393,13 @@ impl Solver {
 
     /// The refined candidates in ranks, and how many the index keeps.
     fn joints(&self, order: &[usize], rank: &[usize]) -> (Vec<Joint>, usize) {
-        let mut joints = Vec::new();
+        let fits = self.kept.iter().flat_map(|kept| &kept.lists).filter_map(|list| list.fits.as_ref());
+        let mut joints = Vec::with_capacity(fits.map(Vec::len).sum());
         let mut near = 0;
         for &piece in order {
             for (mouth, list) in self.kept[piece].lists.iter().enumerate() {
                 near += list.matches.len();
-                for (place, fit) in list.fits.iter().flatten() {
-                    let hit = &list.matches[*place].hit;
+                for (hit, fit) in list.fits.iter().flatten() {
                     let (a, b) = (rank[hit.piece as usize], rank[piece]);
                     joints.push(Joint { a, tab: hit.tab as usize, b, mouth, fit: *fit });
                 }
@@ -527,20 +538,6 @@ fn report(order: &[usize], outlines: &[&Outline], outcome: &Outcome, memory: &Me
     islands.sort_by(|p, q| q.len().cmp(&p.len()).then(p.cmp(q)));
     let poses: Vec<Isometry2<f64>> =
         outcome.poses.iter().map(|p| p.map_or_else(Isometry2::identity, |p| p.1)).collect();
-    let mut assembly = Assembly::default();
-    let mut placed = vec![false; order.len()];
-    for (component, (members, motion)) in frame::lay_out(outlines, &poses, &islands).into_iter().enumerate() {
-        for k in members {
-            placed[k] = true;
-            assembly.placements.push(Placement {
-                piece: order[k],
-                puzzle_from_image: motion * poses[k],
-                component,
-                confidence: outcome.confidence[k],
-            });
-        }
-    }
-    assembly.unplaced = (0..order.len()).filter(|k| !placed[*k]).map(|k| order[k]).collect();
     let mating = |mated: &Mated| {
         let j = &outcome.joints[mated.joint];
         let (tab, mouth) = (&outlines[j.a].tabs[j.tab], &outlines[j.b].mouths[j.mouth]);
@@ -557,18 +554,32 @@ fn report(order: &[usize], outlines: &[&Outline], outcome: &Outcome, memory: &Me
             confidence: mated.confidence,
         }
     };
-    assembly.matings = outcome.matings.par_iter().map(mating).collect();
+    let (laid_out, matings) =
+        rayon::join(|| frame::lay_out(outlines, &poses, &islands), || outcome.matings.par_iter().map(mating).collect());
+    let mut assembly = Assembly { matings, ..Assembly::default() };
+    let mut placed = vec![false; order.len()];
+    for (component, (members, motion)) in laid_out.into_iter().enumerate() {
+        for k in members {
+            placed[k] = true;
+            assembly.placements.push(Placement {
+                piece: order[k],
+                puzzle_from_image: motion * poses[k],
+                component,
+                confidence: outcome.confidence[k],
+            });
+        }
+    }
+    assembly.unplaced = (0..order.len()).filter(|k| !placed[*k]).map(|k| order[k]).collect();
     assembly
 }
 
-/// Counts of the candidate table; `near` are the pairs that the index keeps.
+/// Counts of the candidate table but for [`within_windows`]; `near` are the pairs that the index keeps.
 fn count(outlines: &[&Outline], joints: &[Joint], near: usize) -> TableCounts {
     let segments = |o: &'_ Outline, tabs: bool| if tabs { o.tabs.len() } else { o.mouths.len() };
     let positive: usize = outlines.iter().map(|o| segments(o, true)).sum();
     let negative: usize = outlines.iter().map(|o| segments(o, false)).sum();
     let own: usize = outlines.iter().map(|o| segments(o, true) * segments(o, false)).sum();
     let mut table = TableCounts { positive, negative, pairs: positive * negative - own, ..TableCounts::default() };
-    (table.after_opening, table.after_length) = within_windows(outlines);
     table.after_correlation = near;
     table.after_overlap = joints.iter().filter(|j| !hopeless(j, outlines[j.b])).count();
     table

@@ -12,6 +12,9 @@ pub(super) const COARSE: f64 = 0.05;
 pub(super) const FINE: f64 = 0.02;
 /// Contact of outlines is looked for within this distance, in piece scales.
 const CONTACT_BAND: f64 = 0.035;
+/// Pairs of pieces that one thread looks at before others are asked: most contacts are remembered, and to wake a thread takes as
+/// long as some tens of them.
+const PAIRS: usize = 64;
 
 impl Assembler<'_> {
     /// Pairs of pieces of one island near enough to touch.
@@ -52,6 +55,7 @@ impl Assembler<'_> {
         let pairs = self.neighbours(island);
         let factors: Vec<Factor> = pairs
             .par_iter()
+            .with_min_len(PAIRS)
             .filter_map(|&(p, q)| {
                 let poses = [*self.state.pose(p), *self.state.pose(q)];
                 self.factor((p, place[p]), (q, place[q]), &poses, step)

@@ -82,7 +82,7 @@ impl Assembler<'_> {
             supported.sort_unstable();
             supported.dedup();
             self.calibrate(&supported);
-            rank(&mut self.edges, &self.slots);
+            self.best = rank(&mut self.edges, &self.slots);
             self.learn(&supported);
             guess = self.first_guess();
         }
@@ -235,9 +235,9 @@ impl Assembler<'_> {
 
     /// Cost of the best other candidate in the mouth of one.
     fn best_other(&self, k: usize) -> Option<f64> {
-        let mouth = self.edges[k].slots[1];
-        let others = self.at[mouth.piece].iter().filter(|j| **j != k && self.edges[**j].slots[1] == mouth);
-        others.map(|j| self.edges[*j].cost).min_by(f64::total_cmp)
+        let e = &self.edges[k];
+        let cost = self.best[e.slots[1].number][usize::from(e.mouth_rank == 0)];
+        cost.is_finite().then_some(cost)
     }
 
     /// Before anything is trusted: right candidates cost what noise and sampling make them, wrong ones what the second
@@ -256,11 +256,7 @@ impl Assembler<'_> {
         (0..self.edges.len())
             .filter(|&k| {
                 let e = &self.edges[k];
-                let clear = |slot: Slot| {
-                    self.at[slot.piece].iter().all(|j| {
-                        *j == k || !self.edges[*j].slots.contains(&slot) || self.edges[*j].cost > e.cost + WIDE
-                    })
-                };
+                let clear = |slot: Slot| self.best[slot.number][1] > e.cost + WIDE;
                 e.mouth_rank == 0 && e.tab_rank == 0 && e.slots.into_iter().all(clear)
             })
             .collect()
@@ -276,17 +272,25 @@ fn weigh(guess: &Closure, decoys: &loops::Decoys, found: &mut [loops::Loop]) -> 
     closure
 }
 
-/// Ranks the candidates of each mouth and tab by cost.
-pub(super) fn rank(edges: &mut [Edge], slots: &Slots) {
+/// Ranks the candidates of each mouth and tab by cost, and tells for each of these what the best two cost; infinitely much
+/// where there are none.
+pub(super) fn rank(edges: &mut [Edge], slots: &Slots) -> Vec<[f64; 2]> {
     let mut order: Vec<(f64, usize)> = edges.iter().enumerate().map(|(k, e)| (e.cost, k)).collect();
     order.sort_unstable_by(|p, q| p.0.total_cmp(&q.0).then(p.1.cmp(&q.1)));
     let mut counts = vec![0; slots.count()];
-    for (_, k) in order {
-        let [tab, mouth] = edges[k].slots.map(|s| s.number);
-        (edges[k].tab_rank, edges[k].mouth_rank) = (counts[tab], counts[mouth]);
-        counts[tab] += 1;
-        counts[mouth] += 1;
+    let mut best = vec![[f64::INFINITY; 2]; slots.count()];
+    for (cost, k) in order {
+        let ranks = edges[k].slots.map(|s| {
+            let rank = counts[s.number];
+            counts[s.number] += 1;
+            if let Some(place) = best[s.number].get_mut(rank) {
+                *place = cost;
+            }
+            rank
+        });
+        [edges[k].tab_rank, edges[k].mouth_rank] = ranks;
     }
+    best
 }
 
 pub(super) fn median(values: &mut [f64]) -> Option<f64> {

@@ -133,9 +133,13 @@ impl State {
     }
 
     /// Pieces of an island, itself first.
-    pub(super) fn members(&self, island: usize) -> impl Iterator<Item = usize> {
-        let rest = std::iter::successors(Some(self.next[island]), |k| Some(self.next[*k]));
-        std::iter::once(island).chain(rest.take_while(move |k| *k != island))
+    pub(super) fn members(&self, island: usize) -> impl ExactSizeIterator<Item = usize> {
+        let mut next = island;
+        (0..self.size[island]).map(move |_| {
+            let piece = next;
+            next = self.next[piece];
+            piece
+        })
     }
 
     /// Size of the largest island.

@@ -66,11 +66,9 @@ impl Assembler<'_> {
                 };
                 let mut list: Vec<Match> = hits.into_iter().map(&mut look).collect();
                 let fits = matching::refine(&mut list, segment, self.outlines, fit, feet);
-                self.memory.keep_matches(this, list.iter().map(|m| (isthmus(&m.hit), *m)).collect());
-                let joint = |(place, fit): (usize, _)| {
-                    let hit = &list[place].hit;
-                    Joint { a: hit.piece as usize, tab: hit.tab as usize, b, mouth, fit }
-                };
+                self.memory.keep_matches(this, list.into_iter().map(|m| (isthmus(&m.hit), m)).collect());
+                let joint =
+                    |(hit, fit): (Hit, _)| Joint { a: hit.piece as usize, tab: hit.tab as usize, b, mouth, fit };
                 fits.into_iter().map(joint).collect()
             })
             .collect();
@@ -83,7 +81,7 @@ impl Assembler<'_> {
         }
         let any = self.edges.len() > before;
         if any {
-            rank(&mut self.edges, &self.slots);
+            self.best = rank(&mut self.edges, &self.slots);
         }
         any
     }
