@@ -167,15 +167,13 @@ impl Memory {
         let stride = ((a.scale * step / a.spacing) as usize).max(1);
         let rounded = Rounded::new(a, b_from_a, step / MESHES);
         let key = Key { pieces: [a.serial, b.serial], stride, pose: rounded.place };
-        let known = self.shard(key.pieces).contacts.get_mut(&key).map(|known| {
+        let contact = |equations: &Equations| equations.contact(&rounded.motion_at(&equations.centre), prior);
+        if let Some(known) = self.shard(key.pieces).contacts.get_mut(&key) {
             known.0 = self.solution;
-            known.1
-        });
-        let equations = known.unwrap_or_else(|| {
-            let computed = follow(a, b, &rounded.pose(a), 0.5 * band * (a.scale + b.scale), stride);
-            self.shard(key.pieces).contacts.insert(key, (self.solution, computed));
-            computed
-        })?;
-        Some(equations.contact(&rounded.motion_at(&equations.centre), prior))
+            return known.1.as_ref().map(contact);
+        }
+        let computed = follow(a, b, &rounded.pose(a), 0.5 * band * (a.scale + b.scale), stride);
+        self.shard(key.pieces).contacts.insert(key, (self.solution, computed));
+        computed.as_ref().map(contact)
     }
 }

@@ -199,7 +199,9 @@ impl Outline {
 
     /// Border point at an index that may lie outside `0..n`.
     fn at(&self, index: i64) -> Point {
-        self.points[index.rem_euclid(self.points.len() as i64) as usize]
+        // To divide takes longer than to look whether it has to be done.
+        let n = self.points.len() as i64;
+        self.points[if (0..n).contains(&index) { index } else { index.rem_euclid(n) } as usize]
     }
 
     /// Point at an arc length from the first border point.

@@ -19,12 +19,14 @@ const PAIRS: usize = 64;
 impl Assembler<'_> {
     /// Pairs of pieces of one island near enough to touch.
     pub(super) fn neighbours(&self, island: usize) -> Vec<(usize, usize)> {
+        /// In a grid there are so many pairs for each piece, with those that touch at a corner.
+        const PAIRS_EACH: usize = 4;
         let members = || self.state.members(island);
         let mut placed: Vec<(f64, f64, usize)> =
             members().map(|k| (self.centre_of(k), k)).map(|(c, k)| (c.x, c.y, k)).collect();
         placed.sort_by(|p, q| p.0.total_cmp(&q.0));
         let reach = 2.0 * members().map(|k| self.outlines[k].radius).fold(0.0, f64::max);
-        let mut pairs = Vec::new();
+        let mut pairs = Vec::with_capacity(PAIRS_EACH * placed.len());
         // A sweep along x: only what is within reach there is compared.
         for (i, (x, y, p)) in placed.iter().enumerate() {
             for (other_x, other_y, q) in &placed[i + 1..] {
