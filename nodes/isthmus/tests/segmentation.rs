@@ -235,6 +235,37 @@ fn a_dark_piece_among_bright_ones_is_no_glare() {
     assert!(found.rejected.iter().any(|r| r.reason == Reason::Faint), "{:?}", found.rejected);
 }
 
+/// Colours that differ by three to five times the noise of each channel: the largest of the channels' differences, whose mean noise alone makes a third of
+/// that, would set the border pixels outside.
+#[test]
+fn faint_colours_in_noise() {
+    /// Most that a border as a whole may lie beside the true one, in pixels.
+    const BORDER: f64 = 0.15;
+    let (coverage, necks) = coverage();
+    let true_area: f64 = coverage.iter().sum();
+    for (piece, ground, noise) in [
+        ([34.0, 32.0, 31.0], [54.0, 52.0, 48.0], 5.0),
+        ([205.0, 190.0, 180.0], [228.0, 215.0, 209.0], 7.0),
+        ([120.0, 100.0, 90.0], [100.0, 103.0, 106.0], 4.0),
+    ] {
+        let what = format!("{piece:?} on {ground:?}");
+        let mut rng = StdRng::seed_from_u64(11);
+        let mut pixels = Vec::with_capacity(3 * coverage.len());
+        for c in &coverage {
+            for (piece, ground) in piece.into_iter().zip(ground) {
+                let level: f64 = ground * (1.0 - c) + piece * c + noise * normal(&mut rng);
+                pixels.push(level.round().clamp(0.0, 255.0) as u8);
+            }
+        }
+        let found = segment(&Frame::rgb(SIDE as u32, SIDE as u32, &pixels).unwrap(), &Parameters::default());
+        check(&found, &necks, &what);
+        let borders: Vec<Border> = found.cutouts.iter().map(|c| Border::from_cutout(c).unwrap().0).collect();
+        let sum = |of: fn(&Border) -> f64| borders.iter().map(of).sum::<f64>();
+        let outside = (sum(Border::area) - true_area) / sum(Border::length);
+        assert!(outside.abs() < BORDER, "{what}: the border lies {outside} px outside");
+    }
+}
+
 /// Part of a lamp that pieces hide from the ground: their upper edges cast shadows of a length, the lower the shorter and the less soft.
 fn shadow(coverage: &[f64], length: f64, softness: f64) -> Vec<f64> {
     const LAYERS: usize = 6;

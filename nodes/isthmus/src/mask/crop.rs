@@ -63,7 +63,7 @@ impl Crop {
         let plain = levels.is_uniform() && frame.format == PixelFormat::Grey;
         if plain {
             (self.shape_level, self.ground_level) = (levels.ground + levels.sense * levels.contrast, levels.ground);
-        } else if levels.is_uniform() {
+        } else if levels.is_uniform() && levels.hue.is_none() {
             (self.shape_level, self.ground_level) = (levels.contrast, 0.0);
         } else {
             // Half the contrast and the room above it fill half the scale.

@@ -35,15 +35,51 @@ pub(super) struct Ground {
 }
 
 impl Ground {
-    /// By how much a block differs from the ground, clipping put right.
-    pub(super) fn contrast(&self, blocks: &Blocks, column: usize, row: usize) -> f32 {
+    /// By how much a block differs from the ground, or how far in the direction of a hue, clipping put right.
+    pub(super) fn contrast(&self, blocks: &Blocks, column: usize, row: usize, hue: Option<Hue>) -> f32 {
         let block = row * blocks.columns + column;
-        let Some(clipping) = &self.clipping else { return self.residual[block] };
-        self.difference([column as f64, row as f64], |c| clipping.level(blocks.planes[c][block]))
+        let Some(clipping) = &self.clipping else {
+            return match hue {
+                None => self.residual[block],
+                Some(_) => self.difference([column as f64, row as f64], hue, |c| blocks.planes[c][block]),
+            };
+        };
+        self.difference([column as f64, row as f64], hue, |c| clipping.level(blocks.planes[c][block]))
+    }
+
+    /// The direction in which blocks of a colour frame differ from the ground, on the middle: that in which what the ground scatters by counts least
+    /// (R. A. Fisher, *The use of multiple measurements in taxonomic problems*, 1936).
+    pub(super) fn hue(&self, blocks: &Blocks, list: &[(usize, usize)]) -> Option<Hue> {
+        let [red, green, blue] = &self.surfaces[..] else { return None };
+        let channel = |c: usize, surface: &Surface| {
+            let difference = |&(column, row): &(usize, usize)| {
+                let mean = blocks.planes[c][row * blocks.columns + column];
+                let level = self.clipping.as_ref().map_or(mean, |clipping| clipping.level(mean));
+                level - surface.at(column as f64, row as f64)
+            };
+            median(&list.iter().map(difference).collect::<Vec<_>>())
+        };
+        let middle = [channel(0, red), channel(1, green), channel(2, blue)];
+        let whiten = |d| self.metric.as_ref().map_or(d, |metric| metric.whiten(d));
+        let colour = list
+            .get(list.len() / 2)
+            .map_or([0.0; 3], |&(column, row)| [red, green, blue].map(|surface| surface.at(column as f64, row as f64)));
+        let [white, light] = [middle, colour].map(|d| Vector3::from(whiten(d)));
+        let light = light.try_normalize(f32::MIN_POSITIVE).unwrap_or_default();
+        let across = white - light * (white.dot(&light) * SHADOWS / (1.0 + SHADOWS));
+        let scale = white.amax() / across.dot(&white);
+        let hue = Hue { weights: whiten(across.into()).map(|w| w * scale), gain: across.norm() * scale };
+        scale.is_finite().then_some(hue)
     }
 
     /// The same of a tile of so many blocks a side, by its first one, and its middle.
-    pub(super) fn tile_contrast(&self, blocks: &Blocks, (column, row): (usize, usize), side: usize) -> ([f64; 2], f32) {
+    pub(super) fn tile_contrast(
+        &self,
+        blocks: &Blocks,
+        (column, row): (usize, usize),
+        side: usize,
+        hue: Option<Hue>,
+    ) -> ([f64; 2], f32) {
         let (columns, rows) = (column..blocks.columns.min(column + side), row..blocks.rows.min(row + side));
         let count = (columns.len() * rows.len()) as f32;
         let mean = |plane: &[f32]| {
@@ -52,7 +88,7 @@ impl Ground {
         };
         let level = |mean: f32| self.clipping.as_ref().map_or(mean, |clipping| clipping.level(mean));
         let middle = [&columns, &rows].map(|range| (range.start + range.end - 1) as f64 / 2.0);
-        (middle, self.difference(middle, |c| level(mean(&blocks.planes[c]))))
+        (middle, self.difference(middle, hue, |c| level(mean(&blocks.planes[c]))))
     }
 
     /// The ground along a row, from a column in steps.
@@ -65,9 +101,12 @@ impl Ground {
         GroundRow { levels, channels, metric: self.metric.as_ref() }
     }
 
-    /// By how much the levels of a block differ from the ground: in the metric, by the largest of the channels.
-    fn difference(&self, [column, row]: [f64; 2], level: impl Fn(usize) -> f32) -> f32 {
+    /// By how much the levels of a block differ from the ground: in the metric, by the largest of the channels, or in the direction of a hue.
+    fn difference(&self, [column, row]: [f64; 2], hue: Option<Hue>, level: impl Fn(usize) -> f32) -> f32 {
         let differences = self.surfaces.iter().enumerate().map(|(c, surface)| level(c) - surface.at(column, row));
+        if let Some(hue) = hue {
+            return differences.zip(hue.weights).map(|(d, w)| w * d).sum();
+        }
         match &self.metric {
             None => differences.fold(0.0, |most, d| most.max(d.abs())),
             Some(metric) => {
@@ -78,6 +117,18 @@ impl Ground {
         }
     }
 }
+
+/// A direction of differences in colour.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Hue {
+    /// Differences of the channels, weighted with these, add up to a signed difference.
+    weights: [f32; 3],
+    /// Scatter of that as a part of the scatter of a channel.
+    pub(super) gain: f32,
+}
+
+/// How much the ground's brightness is taken to vary beside pieces, as a part of the variance by noise: shadows count less then, and noise a sixteenth more at most.
+const SHADOWS: f32 = 1.0;
 
 /// Channels of a colour frame.
 const MAX_CHANNELS: usize = 3;
@@ -93,6 +144,16 @@ impl GroundRow<'_> {
     /// The levels of a grey frame's ground.
     pub(super) fn grey(&self) -> Option<AlongRow> {
         (self.channels == 1).then_some(self.levels[0])
+    }
+
+    /// Fills a row with its signed differences from the ground in the direction of a hue, from its pixels.
+    #[inline(always)]
+    pub(super) fn fill_along(&self, hue: Hue, source: &[u8], differences: &mut [f32]) {
+        let ([r, g, b], [red, green, blue]) = (self.levels, hue.weights);
+        for (i, (difference, p)) in differences.iter_mut().zip(source.as_chunks::<3>().0).enumerate() {
+            let [x, y, z] = p.map(f32::from);
+            *difference = red * (x - r.at(i)) + green * (y - g.at(i)) + blue * (z - b.at(i));
+        }
     }
 
     /// Fills a row with its differences from the ground; `values` gives the row's levels in a channel.

@@ -1,7 +1,7 @@
 //! Levels of a component and of the ground round it.
 
 use super::frame::Frame;
-use super::ground::Ground;
+use super::ground::{Ground, Hue};
 use super::runs::Component;
 use super::standing::{MAX_DEPTH, Standing};
 use super::statistics::{median, quantile, quantiles};
@@ -38,6 +38,9 @@ const MOST_SAMPLES: usize = 8_000;
 /// tell it to a thousandth of the contrast at any noise.
 const TILE: usize = 2;
 
+/// One in so many blocks of a shape may be specks or print of the other sense.
+const SPECKS: usize = 20;
+
 /// How a contrast runs over a component's bounding box, in blocks.
 #[derive(Debug, Default)]
 enum Course {
@@ -65,6 +68,8 @@ pub(super) struct Levels {
     pub(super) sense: f32,
     /// Whether the sense is the same everywhere.
     one_sided: bool,
+    /// The direction of the contrast in colour, where it is the same everywhere (colour frames only).
+    pub(super) hue: Option<Hue>,
     /// Ground level (grey frames only).
     pub(super) ground: f32,
     /// By how much it differs over the component.
@@ -96,12 +101,12 @@ impl Region<'_> {
         self.standing.ground.surfaces.first().map_or(0.0, |s| s.at(column as f64, row as f64))
     }
 
-    fn contrast(&self, (column, row): Block) -> f32 {
-        self.standing.ground.contrast(self.standing.blocks, column, row)
+    fn contrast(&self, (column, row): Block, hue: Option<Hue>) -> f32 {
+        self.standing.ground.contrast(self.standing.blocks, column, row, hue)
     }
 
-    fn contrasts(&self, blocks: &[Block]) -> Vec<f32> {
-        blocks.iter().map(|block| self.contrast(*block)).collect()
+    fn contrasts(&self, blocks: &[Block], hue: Option<Hue>) -> Vec<f32> {
+        blocks.iter().map(|block| self.contrast(*block, hue)).collect()
     }
 
     fn is_brighter(&self, (column, row): Block) -> bool {
@@ -204,16 +209,37 @@ impl Levels {
         let step = (((region.bounds.area / LEVEL_SAMPLES) as f64).sqrt() as usize).max(1);
         let inner = region.inner(step);
         self.take_sense(region, &inner);
-        let contrasts = region.contrasts(&inner);
-        self.contrast = median(&contrasts);
-        if inner.is_empty() {
-            return false;
+        // In one direction noise and grain weigh less than by the largest of the channels, and are no contrast.
+        self.hue = region.standing.ground.hue(region.standing.blocks, &inner);
+        if let Some(hue) = self.hue {
+            let contrasts = region.contrasts(&inner, self.hue);
+            self.contrast = median(&contrasts);
+            let opposite = contrasts.iter().filter(|c| 2.0 * **c < self.contrast).count();
+            if opposite * SPECKS <= inner.len()
+                && self.take_even(region, &inner, &contrasts, (step, hue.gain * scatter))
+            {
+                return true;
+            }
+            self.hue = None;
         }
-        if self.is_ground_even(region) && is_uniform(&contrasts, self.contrast, scatter) {
+        let contrasts = region.contrasts(&inner, None);
+        self.contrast = median(&contrasts);
+        !inner.is_empty() && self.take_even(region, &inner, &contrasts, (step, scatter))
+    }
+
+    /// Takes the contrasts of blocks, every so many of them, for one contrast, or one that runs smoothly, if they are.
+    fn take_even(
+        &mut self,
+        region: &Region<'_>,
+        inner: &[Block],
+        contrasts: &[f32],
+        (step, scatter): (usize, f32),
+    ) -> bool {
+        if self.is_ground_even(region) && is_uniform(contrasts, self.contrast, scatter) {
             return true;
         }
         let side = if scatter > MAP_NOISE * self.contrast { step.min(TILE) } else { 1 };
-        self.take_smooth(region, &inner, &contrasts, side)
+        self.take_smooth(region, inner, contrasts, (side, scatter))
     }
 
     /// Takes the contrast of a component that has no even body (thin, or printed on) from its blocks beyond the blur of its edge.
@@ -224,7 +250,7 @@ impl Levels {
         let is_deep = |depth: u8| depth >= settled;
         let deep: Vec<Block> =
             region.blocks().zip(&depths).filter(|(_, depth)| is_deep(**depth)).map(|(block, _)| block).collect();
-        let contrasts = region.contrasts(&deep);
+        let contrasts = region.contrasts(&deep, None);
         if settled < INNER_DEPTH {
             // Thinner than three blocks: the strongest blocks are the best there is.
             self.contrast = quantile(&contrasts, 0.9);
@@ -235,10 +261,11 @@ impl Levels {
         }
         self.contrast = median(&contrasts);
         let is_even = self.is_ground_even(region) && is_uniform(&contrasts, self.contrast, scatter);
-        if is_even || self.take_smooth(region, &deep, &contrasts, 1) {
+        if is_even || self.take_smooth(region, &deep, &contrasts, (1, scatter)) {
             return;
         }
-        let contrast_of = |(block, depth): (Block, &u8)| if is_deep(*depth) { region.contrast(block) } else { 0.0 };
+        let contrast_of =
+            |(block, depth): (Block, &u8)| if is_deep(*depth) { region.contrast(block, None) } else { 0.0 };
         let map = region.blocks().zip(&depths).map(contrast_of).collect();
         let noise = scatter / self.contrast.max(f32::MIN_POSITIVE);
         let reach = usize::from(settled) + BORDER_BLOCKS;
@@ -246,14 +273,20 @@ impl Levels {
     }
 
     /// Takes the contrast of blocks for a smooth surface over the component, if it is one; it is fitted to tiles of so many blocks a side.
-    fn take_smooth(&mut self, region: &Region<'_>, inner: &[Block], contrasts: &[f32], side: usize) -> bool {
+    fn take_smooth(
+        &mut self,
+        region: &Region<'_>,
+        inner: &[Block],
+        contrasts: &[f32],
+        (side, scatter): (usize, f32),
+    ) -> bool {
         let local = |[column, row]: [f64; 2]| [column - self.left as f64, row - self.top as f64];
         let chosen = || inner.iter().zip(contrasts).step_by((inner.len() / MOST_SAMPLES).max(1));
         let light = Surface::fit(
             [self.width, self.height],
             chosen().map(|(block, contrast)| {
                 let (middle, contrast) = if side > 1 {
-                    region.standing.ground.tile_contrast(region.standing.blocks, *block, side)
+                    region.standing.ground.tile_contrast(region.standing.blocks, *block, side, self.hue)
                 } else {
                     (middle(*block), *contrast)
                 };
@@ -268,7 +301,7 @@ impl Levels {
             contrast - light.at(x, y)
         };
         let residuals: Vec<f32> = chosen().map(residual).collect();
-        let is_smooth = is_light && is_uniform(&residuals, self.contrast, region.standing.ground.scatter);
+        let is_smooth = is_light && is_uniform(&residuals, self.contrast, scatter);
         if is_smooth {
             self.course = Course::Smooth(light);
         }
@@ -286,8 +319,7 @@ impl Levels {
         let all = inner.len();
         let brighter = inner.iter().filter(|block| is_grey && region.is_brighter(**block)).count();
         self.sense = if 2 * brighter >= all { 1.0 } else { -1.0 };
-        // A twentieth of the blocks may be specks or print.
-        self.one_sided = is_grey && all > 0 && brighter.min(all - brighter) * 20 <= all;
+        self.one_sided = is_grey && all > 0 && brighter.min(all - brighter) * SPECKS <= all;
     }
 
     /// Whether one pair of levels will do.
@@ -397,7 +429,9 @@ impl Levels {
             line.clear();
             line.resize(out.len(), 0.0);
         }
-        if let Some(ground) = signed {
+        if let Some(hue) = self.hue {
+            widely!(ground.fill_along(hue, source, difference));
+        } else if let Some(ground) = signed {
             for (i, (d, p)) in difference.iter_mut().zip(source).enumerate() {
                 *d = self.sense * (f32::from(*p) - ground.at(i));
             }

@@ -32,6 +32,11 @@ impl Metric {
         Some(Self([0, 1, 2].map(|row| [0, 1, 2].map(|column| metric[(row, column)]))))
     }
 
+    /// A difference in this metric.
+    pub(super) fn whiten(&self, difference: [f32; 3]) -> [f32; 3] {
+        self.0.map(|w| w.iter().zip(difference).map(|(w, d)| w * d).sum())
+    }
+
     /// Length of a difference: the largest of the channels, as everywhere.
     #[inline(always)]
     pub(super) fn length(&self, [r, g, b]: [f32; 3]) -> f32 {
