@@ -119,7 +119,7 @@ impl Solver {
 
     /// The candidate table of the last [`Solver::solve`]: pairs of a tab and a mouth of different pieces, each with its
     /// figures and its fate. Of small puzzles (up to 25 000 pairs, some 60 pieces) every pair is listed, and the rows
-    /// add up to [`Assembly::table`]; of larger ones only the pairs that were refined are, and the rest is counted there.
+    /// add up to [`Assembly::table`](crate::Assembly::table); of larger ones only the pairs that were refined are, and the rest is counted there.
     pub fn candidates(&self) -> Vec<Candidate> {
         let Some(Solution { order, outcome, table }) = &self.last else { return Vec::new() };
         let joints = &outcome.joints;
