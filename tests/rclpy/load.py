@@ -244,7 +244,12 @@ def main():
         return relay(arguments.domain)
     # Whoever ends this ends what it has started, too.
     signal.signal(signal.SIGTERM, lambda *_: sys.exit("load: ended by a signal"))
-    environment = os.environ | {"ROS_DOMAIN_ID": str(arguments.domain), "ROS_LOCALHOST_ONLY": "1"}
+    # One arena, as launch-scripts/cell.sh has it.
+    environment = os.environ | {
+        "ROS_DOMAIN_ID": str(arguments.domain),
+        "ROS_LOCALHOST_ONLY": "1",
+        "MALLOC_ARENA_MAX": "1",
+    }
     size = {"latency": (4, 6, 5), "soak": (8, 12, 1)}[arguments.what]
     expected = ["--ros-args", "-p", f"solver_node:expected_pieces:={size[0] * size[1]}"]
     commands = {name: [arguments.binaries / name, *expected] for name in NODES}
