@@ -60,6 +60,14 @@ pub(crate) fn camera(topic: &str) -> &str {
     topic.strip_suffix("/compressed").unwrap_or(topic)
 }
 
+/// When the pieces of a frame were seen, in nanoseconds. Of a file that is not known (0), for its time is that of the file; names
+/// of topics begin with a slash, which those of files don't hold.
+pub(crate) fn seen(source: &str, stamp: &Time) -> u64 {
+    const SECOND: u64 = 1_000_000_000;
+    let since_the_epoch = u64::try_from(stamp.sec).unwrap_or(0) * SECOND + u64::from(stamp.nanosec);
+    if source.starts_with('/') { since_the_epoch } else { 0 }
+}
+
 /// A picture as a message, `rgb8`.
 pub(crate) fn image_message(header: Header, picture: RgbImage) -> Image {
     Image {

@@ -104,7 +104,7 @@ pub fn piece_features(data: &[u8]) {
     if piece.features.border.points.len() > LARGEST_MATCHED {
         return;
     }
-    let other = Piece { id: format!("{}_", piece.id), features: piece.features.clone() };
+    let other = Piece { id: format!("{}_", piece.id), ..piece.clone() };
     let Ok(mut solver) = Solver::new(Params { threads: 1, ..Params::default() }) else { return };
     if solver.insert(piece).is_ok() && solver.insert(other).is_ok() {
         solver.solve();
@@ -189,7 +189,7 @@ pub fn border(data: &[u8]) {
     let spacing = length / points.len().max(1) as f64;
     let Ok(features) = Features::from_border(Border { points, spacing }, 0.05) else { return };
     let Ok(mut solver) = Solver::new(Params { threads: 1, ..Params::default() }) else { return };
-    let pieces = ["a", "b"].map(|id| Piece { id: id.to_owned(), features: features.clone() });
+    let pieces = ["a", "b"].map(|id| Piece { id: id.to_owned(), seen: 0, features: features.clone() });
     if pieces.into_iter().all(|piece| solver.insert(piece).is_ok()) {
         solver.solve();
     }

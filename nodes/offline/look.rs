@@ -7,6 +7,7 @@ use std::time::Instant;
 use isthmus::mask::{self, Cutout, Segmentation, Segmenter};
 use isthmus::{Extractor, Features};
 use jigsaw::Piece;
+use jigsaw_msgs::builtin_interfaces::msg::Time;
 use rayon::prelude::*;
 
 use super::inputs::{Input, Origin};
@@ -15,6 +16,7 @@ use crate::capture::convert::{FrameError, Picture};
 use crate::capture::cut::{self, Pixels};
 use crate::capture::known::{FrameName, Known};
 use crate::capture::params::SAME_PLACE_OVERLAP;
+use crate::fields;
 use crate::results::Seconds;
 
 /// Images segmented at once: bounds the memory for pixels, and keeps all threads busy.
@@ -138,6 +140,10 @@ impl Names {
                 admitted.into_iter().map(|a| (a.publish && !self.taken.contains(&a.id)).then_some(a.id)).collect()
             }
         };
+        let seen = match &looked.name {
+            FrameName::File(_) => 0,
+            FrameName::Stamp(topic, sec, nanosec) => fields::seen(topic, &Time { sec: *sec, nanosec: *nanosec }),
+        };
         let mut shapes = vec![];
         for ((cutout, features), id) in cutouts.into_iter().zip(features).zip(ids) {
             let Some(wanted) = id else { continue };
@@ -152,7 +158,7 @@ impl Names {
             if id != wanted {
                 warnings.push(format!("{source}: id {wanted} is taken, called {id} instead"));
             }
-            let seen = Seen { source: source.clone(), aoi: cutout.aoi, piece: Piece { id, features } };
+            let seen = Seen { source: source.clone(), aoi: cutout.aoi, piece: Piece { id, seen, features } };
             shapes.push((cutout, seen));
         }
         Named { stem, frame: looked.frame, shapes, unusable: looked.unusable }

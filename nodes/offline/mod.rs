@@ -39,7 +39,7 @@ pub use report::{OfflineError, Progress};
 /// What became of [`assemble`].
 #[derive(Debug, Clone, PartialEq)]
 pub struct Outcome {
-    /// Pieces found.
+    /// Pieces found, each once: not where one lay before it was seen elsewhere.
     pub pieces: usize,
     /// Pieces placed in the largest assembly.
     pub placed: usize,
@@ -109,7 +109,7 @@ pub fn assemble(
     write_png(&out.join(ASSEMBLY_PICTURE), &picture::assembly(pieces, &assembly, picture::AssemblyStyle::default()))?;
     progress.step();
     Ok(Outcome {
-        pieces: pieces.len(),
+        pieces: pieces.len() - assembly.earlier.len(),
         placed: assembly.placements.iter().filter(|p| p.component == 0).count(),
         components: assembly.placements.iter().map(|p| p.component + 1).max().unwrap_or(0),
         matings: assembly.matings.len(),
@@ -132,7 +132,7 @@ pub fn inspect(paths: &[PathBuf], out: &Path, progress: &dyn Progress) -> Result
             .shapes
             .par_iter()
             .map(|(cutout, seen)| {
-                let Piece { id, features } = &seen.piece;
+                let Piece { id, features, .. } = &seen.piece;
                 let style = picture::InspectionStyle::default();
                 let drawn = picture::inspection(id, &seen.source, cutout, features, style);
                 write_png(&out.join(format!("{id}{OVERLAY_ENDING}")), &drawn)

@@ -30,7 +30,7 @@ mod tests {
             let view = mask::Frame::grey(frame.width, frame.height, &frame.pixels).unwrap();
             let cutout = mask::segment(&view, &mask::Parameters::default()).cutouts.remove(0);
             let features = Extractor::default().extract(&cutout).unwrap();
-            pieces.push(Piece { id: puzzle.pieces()[k].id.clone(), features });
+            pieces.push(Piece { id: puzzle.pieces()[k].id.clone(), seen: 0, features });
             cutouts.push(cutout);
             let puzzle_from_image = puzzle.puzzle_from_image(k).unwrap();
             assembly.placements.push(Placement { piece: k, puzzle_from_image, component: 0, confidence: 1.0 });

@@ -289,7 +289,7 @@ impl Table {
 
     async fn send(&mut self, solution: Solution) {
         let message = solution.assembly_message();
-        let (placed, seen) = (message.pieces.len(), solution.pieces.len());
+        let (placed, seen) = (message.pieces.len(), solution.pieces.len() - solution.assembly.earlier.len());
         let state = match message.state {
             AssemblyMessage::COMPLETE => "complete",
             AssemblyMessage::PARTIAL => "partial",

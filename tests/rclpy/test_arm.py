@@ -1,4 +1,5 @@
-"""An arm that follows the cell puts a puzzle together: its motions are done to the pieces in a picture of the table."""
+"""An arm that follows the cell puts a puzzle together: its motions are done to the pieces in a picture of the table, where
+somebody has moved one meanwhile."""
 
 import json
 import math
@@ -10,11 +11,12 @@ import numpy
 from builtin_interfaces.msg import Time
 from PIL import Image as Picture
 
-from bench import METRES_PER_PIXEL, SCALE, Camera, image_message
+from bench import METRES_PER_PIXEL, SCALE, Arm, Camera, image_message
 from conftest import EVENT_TIMEOUT, ROOT
 
 WIDTH, HEIGHT = 2700, 1300  # of the table as the camera sees it
 PITCH = 340  # px between the pieces as they lie, in the left half
+ASIDE = 1700.0, 300.0, 0.7  # where somebody lays a piece, and how it is turned
 ORIGIN = 2500, 1150  # px where the puzzle's bottom left corner is to lie,
 QUARTER = math.pi / 2  # turned by so much: the puzzle lies to the left of it, on its right side
 BRIGHT, DARK = 225.0, 30.0  # grey levels of the light table and of the pieces on it, as the generator has them
@@ -36,11 +38,11 @@ class Table:
         """The piece that lies there."""
         return min(range(len(self.poses)), key=lambda k: math.dist(self.poses[k][:2], (x, y)))
 
-    def coverage(self):
-        """How many pieces cover each pixel."""
+    def coverage(self, pieces=None):
+        """How many pieces cover each pixel: all, or the first so many."""
         side = 2 * max(self.patches[0].size)  # a turned patch fits in, and a rim of this width takes what sticks out
         total = numpy.zeros((HEIGHT + 2 * side, WIDTH + 2 * side), numpy.float32)
-        for patch, (x, y, turn) in zip(self.patches, self.poses, strict=True):
+        for patch, (x, y, turn) in list(zip(self.patches, self.poses, strict=True))[:pieces]:
             cos, sin = math.cos(turn), math.sin(turn)
             left, top = int(x) - side // 2, int(y) - side // 2
             # Where each pixel of the table lies in the patch; Pillow's pixel centres lie at halves.
@@ -51,9 +53,9 @@ class Table:
             total[top + side : top + 2 * side, left + side : left + 2 * side] += numpy.asarray(seen)
         return total[side:-side, side:-side]
 
-    def picture(self):
+    def picture(self, pieces=None):
         """The table in grey levels."""
-        return numpy.clip(BRIGHT - (BRIGHT - DARK) * self.coverage(), 0, 255).round().astype(numpy.uint8)
+        return numpy.clip(BRIGHT - (BRIGHT - DARK) * self.coverage(pieces), 0, 255).round().astype(numpy.uint8)
 
 
 def pixels(pose):
@@ -76,8 +78,18 @@ def test_what_the_arm_is_told_puts_the_puzzle_together(launcher, ros, domain, ge
         text=True,
     )
     try:
-        camera = Camera(ros)
-        camera.show(image_message(table.picture(), Time(sec=1)), seen=lambda: len(camera.features.get(1, [])) == 12)
+        camera, looker = Camera(ros), Arm(ros, name="looker")
+
+        def show(second, picture, new):
+            ids = lambda: {features.id for features in camera.features.get(second, [])}
+            camera.show(image_message(picture, Time(sec=second)), seen=lambda: len(ids()) >= new)
+            ros.until(lambda: all(map(looker.knows, ids())), f"assembly with what is new in picture {second}")
+
+        # All pieces but one, of which one is moved before the last is laid down.
+        show(1, table.picture(11), 11)
+        table.poses[4] = ASIDE
+        show(2, table.picture(11), 1)
+        show(3, table.picture(), 1)
         told, _ = arm.communicate(timeout=EVENT_TIMEOUT)
     finally:
         arm.kill()

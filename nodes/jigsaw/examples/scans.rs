@@ -31,7 +31,7 @@ fn load(path: &Path) -> anyhow::Result<Vec<Piece>> {
     let mut pieces = Vec::new();
     for (k, cutout) in segmentation.cutouts.iter().enumerate() {
         let features = extractor.extract(cutout).with_context(|| path.display().to_string())?;
-        pieces.push(Piece { id: if many { format!("{stem}_{k}") } else { stem.clone() }, features });
+        pieces.push(Piece { id: if many { format!("{stem}_{k}") } else { stem.clone() }, seen: 0, features });
     }
     Ok(pieces)
 }

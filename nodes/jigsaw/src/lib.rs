@@ -31,6 +31,9 @@ pub use solver::{Candidate, Fate, Posed, Rule, Solver, SolverError, assemble};
 pub struct Piece {
     /// Unique name.
     pub id: String,
+    /// When it was seen, in whatever unit grows with time; the same for all where that is not known. Of pieces of one shape the one
+    /// seen last is where it is now, and the others are where it was.
+    pub seen: u64,
     /// Its shape.
     pub features: isthmus::Features,
 }
@@ -101,6 +104,8 @@ pub struct Assembly {
     pub matings: Vec<Mating>,
     /// Pieces left over.
     pub unplaced: Vec<usize>,
+    /// Neither placed nor left over: earlier sightings of pieces that were seen elsewhere since.
+    pub earlier: Vec<usize>,
     /// The candidate table after each rule.
     pub table: TableCounts,
     /// Whether the time budget ran out, so that this is the best assembly so far.

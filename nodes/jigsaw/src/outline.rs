@@ -116,6 +116,8 @@ pub(crate) struct Foot {
 pub(crate) struct Outline {
     /// Tells it from all others that the solver has seen.
     pub(crate) serial: u64,
+    /// When it was seen.
+    pub(crate) seen: u64,
     pub(crate) points: Vec<Point>,
     pub(crate) normals: Vec<Vector2<f32>>,
     pub(crate) spacing: f64,
@@ -167,6 +169,7 @@ impl Outline {
         let reaches = std::array::from_fn(|k| distances[(2 * k + 1) * n / (2 * REACHES)] as f32);
         let mut outline = Self {
             serial,
+            seen: piece.seen,
             raster: Raster::new(&points, area.sqrt() / RASTER_CELLS),
             hull: convex_hull(points.clone()),
             points,

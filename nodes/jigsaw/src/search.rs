@@ -25,7 +25,6 @@ mod verify;
 mod widen;
 
 use crate::contact::ClearancePrior;
-use crate::copies::copies;
 use crate::loops::{Closure, Edge};
 use crate::memory::Memory;
 use crate::outline::Outline;
@@ -109,10 +108,11 @@ struct Assembler<'a> {
     partial: bool,
 }
 
-/// Assembles; `joints`, the candidates, are in the order of ranks.
+/// Assembles; `joints`, the candidates, are in the order of ranks. Pieces `aside` wait until the others are placed.
 pub(crate) fn assemble(
     outlines: &[&Outline],
     joints: Vec<Joint>,
+    aside: Vec<bool>,
     params: &Params,
     memory: &Memory,
     budget: &dyn Budget,
@@ -157,7 +157,7 @@ pub(crate) fn assemble(
         learnt: false,
         present: 0.0,
         closure: Closure::guess(0.02, 1.0, 0.0),
-        aside: vec![false; n],
+        aside,
         state: State::new(n, &slots),
         slots,
         plan: None,
@@ -204,8 +204,6 @@ fn covariance(information: &Matrix3<f64>, scale: f64) -> Matrix3<f64> {
 impl Assembler<'_> {
     /// The standard policy.
     fn run(&mut self) -> Outcome {
-        // Of pieces that are there twice one makes the puzzle: two would take each other's place.
-        self.aside = copies(self.outlines);
         self.model = self.first_model();
         self.learn_from_outstanding();
         let found = if self.params.loops { self.close_loops() } else { Vec::new() };

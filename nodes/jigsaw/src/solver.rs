@@ -2,6 +2,7 @@
 
 mod table;
 
+use crate::copies::{Standing, copies};
 use crate::correlation::correlate;
 use crate::index::{Entry, Hit, Index, Windows};
 use crate::matching::{List, Match};
@@ -67,6 +68,8 @@ struct Kept {
     current: bool,
     /// Whether its own tabs have been offered to all others.
     offered: bool,
+    /// Whether it was seen again later, elsewhere: then it has no part in the puzzle.
+    earlier: bool,
 }
 
 /// The solver. Pieces are taken in one by one; [`Solver::solve`] matches what is new and assembles all.
@@ -149,7 +152,8 @@ impl Solver {
         self.index_of.insert(piece.id.clone(), index);
         self.pieces.push(piece);
         self.serials += 1;
-        self.kept.push(Kept { serial: self.serials, outline: None, lists: Vec::new(), current: false, offered: false });
+        let (serial, lists) = (self.serials, Vec::new());
+        self.kept.push(Kept { serial, outline: None, lists, current: false, offered: false, earlier: false });
         Ok(index)
     }
 
@@ -159,7 +163,22 @@ impl Solver {
         for other in self.index_of.values_mut().filter(|other| **other > index) {
             *other -= 1;
         }
+        self.withdraw(index);
         self.kept.remove(index);
+        for kept in &mut self.kept {
+            for list in &mut kept.lists {
+                let fits = list.fits.iter_mut().flatten().map(|(hit, _)| hit);
+                for hit in list.matches.iter_mut().map(|m| &mut m.hit).chain(fits) {
+                    hit.piece -= u32::from(hit.piece as usize > index);
+                }
+            }
+        }
+        self.last = None;
+        Some(self.pieces.remove(index))
+    }
+
+    /// Takes a piece out of the candidates.
+    fn withdraw(&mut self, index: usize) {
         for kept in &mut self.kept {
             for list in &mut kept.lists {
                 let before = list.matches.len();
@@ -169,14 +188,11 @@ impl Solver {
                     kept.current = false;
                     list.fits = None;
                 }
-                let fits = list.fits.iter_mut().flatten().map(|(hit, _)| hit);
-                for hit in list.matches.iter_mut().map(|m| &mut m.hit).chain(fits) {
-                    hit.piece -= u32::from(hit.piece as usize > index);
-                }
             }
         }
-        self.last = None;
-        Some(self.pieces.remove(index))
+        let kept = &mut self.kept[index];
+        kept.lists.clear();
+        (kept.current, kept.offered) = (false, false);
     }
 
     /// Forgets all pieces.
@@ -209,14 +225,26 @@ impl Solver {
         // Ranks by id make the result independent of the order of insertion.
         let mut order: Vec<usize> = (0..self.pieces.len()).collect();
         order.sort_by(|p, q| self.pieces[*p].id.cmp(&self.pieces[*q].id));
-        let mut rank = vec![0; order.len()];
-        for (r, k) in order.iter().enumerate() {
-            rank[*k] = r;
-        }
         let pieces = &self.pieces;
         self.kept.par_iter_mut().enumerate().for_each(|(k, kept)| {
             kept.outline.get_or_insert_with(|| Outline::new(&pieces[k], kept.serial));
         });
+        let standings = copies(&ranked(&self.kept, &order));
+        for (k, standing) in order.iter().zip(&standings) {
+            let earlier = *standing == Standing::Earlier;
+            if earlier && !self.kept[*k].earlier {
+                self.withdraw(*k);
+            }
+            self.kept[*k].earlier = earlier;
+        }
+        let (earlier, order): (Vec<usize>, Vec<usize>) = order.into_iter().partition(|k| self.kept[*k].earlier);
+        // Of pieces that are there twice one makes the puzzle: two would take each other's place.
+        let present = standings.into_iter().filter(|s| *s != Standing::Earlier);
+        let aside = present.map(|s| s == Standing::Copy && self.params.policy == Policy::Standard).collect();
+        let mut rank = vec![0; self.pieces.len()];
+        for (r, k) in order.iter().enumerate() {
+            rank[*k] = r;
+        }
         let (joints, mut table, whole) = if self.params.policy == Policy::Paper {
             paper::candidates(&ranked(&self.kept, &order), &|| budget.spent() >= MATCHING_SHARE)
         } else {
@@ -230,7 +258,7 @@ impl Solver {
         let outlines = ranked(&self.kept, &order);
         // What is only counted is counted meanwhile.
         let (outcome, passed) = rayon::join(
-            || search::assemble(&outlines, joints, &self.params, &self.memory, budget),
+            || search::assemble(&outlines, joints, aside, &self.params, &self.memory, budget),
             || (self.params.policy == Policy::Standard).then(|| within_windows(&outlines)),
         );
         if let Some(passed) = passed {
@@ -238,6 +266,7 @@ impl Solver {
         }
         self.count_brought_up(&mut table, &order, &outlines, &outcome);
         let mut assembly = report(&order, &outlines, &outcome, &self.memory);
+        assembly.earlier = earlier;
         assembly.table = TableCounts { backtracks: outcome.backtracks, ..table };
         assembly.partial = outcome.partial || !whole;
         assembly.timings =
@@ -249,12 +278,13 @@ impl Solver {
     /// Finds the candidates of new mouths among all tabs, and of old mouths among the new tabs; tells whether the budget
     /// was enough for all.
     fn match_new(&mut self, rank: &[usize], budget: &dyn Budget) -> bool {
-        if self.kept.iter().all(|k| k.current && k.offered) {
+        if self.kept.iter().all(|k| k.earlier || k.current && k.offered) {
             return true;
         }
         // Lists and outlines are taken apart, so that the ones can be filled while the others are read.
         let mut lists: Vec<(bool, Vec<List>)> =
             self.kept.iter_mut().map(|k| (k.current, std::mem::take(&mut k.lists))).collect();
+        let present = || (0..self.kept.len()).filter(|k| !self.kept[*k].earlier);
         let outlines: Vec<&Outline> = self.kept.iter().filter_map(|k| k.outline.as_ref()).collect();
         let entries = |pieces: &mut dyn Iterator<Item = usize>| -> Vec<Entry> {
             let mut entries = Vec::new();
@@ -272,12 +302,15 @@ impl Solver {
         let mouths = |current: bool| -> usize {
             lists.iter().zip(&outlines).filter(|(list, _)| list.0 == current).map(|(_, o)| o.mouths.len()).sum()
         };
-        let all = Index::new(entries(&mut (0..outlines.len())), mouths(false));
-        let new = Index::new(entries(&mut (0..outlines.len()).filter(|k| !self.kept[*k].offered)), mouths(true));
+        let all = Index::new(entries(&mut present()), mouths(false));
+        let new = Index::new(entries(&mut present().filter(|k| !self.kept[*k].offered)), mouths(true));
         let most = self.params.candidates;
         let free = self.params.fit_clearance;
         let whole = AtomicBool::new(true);
         lists.par_iter_mut().enumerate().for_each_init(placement::Feet::default, |feet, (piece, (current, lists))| {
+            if self.kept[piece].earlier {
+                return;
+            }
             if budget.spent() >= MATCHING_SHARE {
                 whole.store(false, Ordering::Relaxed);
                 *current = false;
@@ -310,7 +343,7 @@ impl Solver {
         });
         for (kept, (current, lists)) in self.kept.iter_mut().zip(lists) {
             (kept.current, kept.lists) = (current, lists);
-            kept.offered = true;
+            kept.offered = !kept.earlier;
         }
         whole.into_inner()
     }

@@ -235,6 +235,63 @@ fn pieces_that_come_one_by_one_make_the_same_assembly() {
     assert_eq!(solver.solve().placements.len(), pieces.len());
 }
 
+/// A piece that lies elsewhere now, as a camera that looks down on the table sees it.
+fn moved(piece: &Piece, id: &str, seen: u64) -> Piece {
+    let mut border = piece.features.border.clone();
+    let motion = nalgebra::Isometry2::new(nalgebra::Vector2::new(300.5, -40.25), 1.0);
+    border.points.iter_mut().for_each(|p| *p = motion * *p);
+    let features = isthmus::Features::from_border(border, piece.features.noise).expect("a border");
+    Piece { id: id.to_owned(), seen, features }
+}
+
+/// Ids of the pieces that are placed, left over, and known from where they lay before, however they come.
+fn ids_of(pieces: &[Piece]) -> [Vec<String>; 3] {
+    let run = |pieces: &[Piece], threads: usize| {
+        let assembly = jigsaw::assemble(pieces, &Params { threads, ..Params::default() }).expect("valid pieces");
+        assert!(assembly.placements.iter().all(|p| p.component == 0));
+        let placed = assembly.placements.iter().map(|p| p.piece).collect();
+        let earlier = assembly.earlier.clone();
+        [placed, assembly.unplaced, earlier].map(|places| {
+            let mut ids: Vec<String> = places.into_iter().map(|k| pieces[k].id.clone()).collect();
+            ids.sort();
+            ids
+        })
+    };
+    let ids = run(pieces, 1);
+    let backwards: Vec<Piece> = pieces.iter().rev().cloned().collect();
+    assert_eq!(run(&backwards, 2), ids);
+    ids
+}
+
+/// Where a piece was seen last it lies; what was seen at once are two pieces.
+#[test]
+fn of_copies_the_one_seen_last_is_placed() {
+    let puzzle = Puzzle::generate(&Options { rows: 3, columns: 4, seed: 9, ..Options::default() }).expect("valid");
+    let before = puzzle.exact().expect("features of true outlines");
+    let names: Vec<String> = before.iter().map(|p| p.id.clone()).collect();
+    let with = |copies: &[Piece]| ids_of(&[&before, copies].concat());
+    let instead = |k: usize, id: &str| {
+        let mut ids = names.clone();
+        ids[k] = id.to_owned();
+        ids.sort();
+        ids
+    };
+    let none: Vec<String> = Vec::new();
+    for id in ["a", "z"] {
+        // Wherever the new name stands among the others.
+        let [placed, unplaced, earlier] = with(&[moved(&before[5], id, 1)]);
+        assert_eq!((placed, unplaced, earlier), (instead(5, id), none.clone(), vec![names[5].clone()]));
+    }
+    assert_eq!(with(&[moved(&before[5], "a", 0)]), [instead(5, "a"), vec![names[5].clone()], none.clone()]);
+    assert_eq!(with(&[moved(&before[5], "z", 0)]), [names.clone(), vec!["z".to_owned()], none.clone()]);
+    let twice = [moved(&before[5], "a", 1), moved(&before[5], "b", 2)];
+    assert_eq!(with(&twice), [instead(5, "b"), none.clone(), vec!["a".to_owned(), names[5].clone()]]);
+    // Somebody has swept over the table: where the pieces lay is no second puzzle.
+    let swept: Vec<Piece> = before.iter().map(|p| moved(p, &format!("{}_again", p.id), 1)).collect();
+    let again: Vec<String> = names.iter().map(|id| format!("{id}_again")).collect();
+    assert_eq!(with(&swept), [again, none, names]);
+}
+
 #[test]
 fn nothing_is_made_of_nothing() {
     let assembly = jigsaw::assemble(&[], &Params::default()).expect("no pieces are no error");
@@ -294,7 +351,7 @@ fn scaled(piece: &Piece, scale: [f64; 2]) -> Piece {
         border.points.reverse();
     }
     let noise = piece.features.noise;
-    Piece { id: piece.id.clone(), features: isthmus::Features::from_border(border, noise).expect("a border") }
+    Piece { features: isthmus::Features::from_border(border, noise).expect("a border"), ..piece.clone() }
 }
 
 /// Scanners stretch what they scan: a piece that is off by 2 % is laid where its whole border fits, but its mirror image

@@ -10,7 +10,9 @@ use jigsaw_msgs::builtin_interfaces::msg::Time;
 use jigsaw_msgs::msg::{Isthmus as IsthmusMessage, PieceFeatures, SkeletonBranch};
 use nalgebra::Point2;
 
-use crate::fields::{MAX_ID_LENGTH, MAX_SIDE_PX, SCALE_RULE, SCALES, camera, header_fault, is_piece_id, text_fault};
+use crate::fields::{
+    MAX_ID_LENGTH, MAX_SIDE_PX, SCALE_RULE, SCALES, camera, header_fault, is_piece_id, seen, text_fault,
+};
 use crate::ros::health::shown;
 use crate::ros::transforms::PixelPlane;
 
@@ -209,7 +211,8 @@ pub fn piece(message: &PieceFeatures) -> Result<(Piece, Sighting), FeaturesError
         centroid_in_image,
         border_in_image: border.points,
     };
-    Ok((Piece { id: id.clone(), features }, sighting))
+    let seen = seen(&message.source, &message.header.stamp);
+    Ok((Piece { id: id.clone(), seen, features }, sighting))
 }
 
 type Check<'a> = dyn Fn(&'static str, bool, &dyn ToString, &dyn ToString) -> Result<(), FeaturesError> + 'a;

@@ -60,16 +60,21 @@ impl Solution {
     /// How far the puzzle is.
     pub fn state(&self) -> u8 {
         let placed = self.assembly.placements.len();
-        if placed == 0 || self.assembly.matings.is_empty() && self.pieces.len() != 1 {
+        if placed == 0 || self.assembly.matings.is_empty() && self.present().count() != 1 {
             return AssemblyMessage::COLLECTING;
         }
-        let one_assembly =
-            self.assembly.unplaced.is_empty() && self.assembly.placements.iter().all(|p| p.component == 0);
+        let one_assembly = self.assembly.placements.iter().all(|p| p.component == 0);
         let whole = match self.naming.expected_pieces {
-            0 => self.pieces.len() > 1 && !self.has_open_mouth(),
+            0 => placed > 1 && self.assembly.unplaced.is_empty() && !self.has_open_mouth(),
             expected => placed >= expected,
         };
         if one_assembly && whole { AssemblyMessage::COMPLETE } else { AssemblyMessage::PARTIAL }
+    }
+
+    /// The pieces that there are, with their sightings and places among all: not where one lay before it was seen elsewhere.
+    fn present(&self) -> impl Iterator<Item = (usize, (&Piece, &Sighting))> {
+        let all = self.pieces.iter().zip(&self.sightings).enumerate();
+        all.filter(|(k, _)| !self.assembly.earlier.contains(k))
     }
 
     /// Whether a piece has a mouth that no tab is in: then another piece is still to come. (Necks don't tell: a body
@@ -77,7 +82,7 @@ impl Solution {
     fn has_open_mouth(&self) -> bool {
         let mated: HashSet<(usize, usize)> =
             self.assembly.matings.iter().map(|m| (m.negative_piece, m.negative_isthmus)).collect();
-        self.pieces.iter().enumerate().any(|(p, piece)| {
+        self.present().any(|(p, (piece, _))| {
             piece.features.isthmuses.iter().enumerate().any(|(i, isthmus)| {
                 isthmus.polarity == Polarity::Negative && isthmus.salient && !mated.contains(&(p, i))
             })
@@ -162,7 +167,7 @@ impl Solution {
             },
         };
         let plane = self.puzzle_plane();
-        let observed = self.pieces.iter().zip(&self.sightings).map(|(piece, sighting)| {
+        let observed = self.present().map(|(_, (piece, sighting))| {
             let child = format!("piece_{}", piece.id);
             transform(&self.naming.table_frame, child, &sighting.stamp, Self::observed(sighting))
         });

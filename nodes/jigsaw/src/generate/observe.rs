@@ -48,7 +48,7 @@ impl Puzzle {
         let piece = |k: usize| {
             let id = self.pieces()[k].id.clone();
             match isthmus::Features::from_border(self.border(k, 1.0), 0.0) {
-                Ok(features) => Ok(Piece { id, features }),
+                Ok(features) => Ok(Piece { id, seen: 0, features }),
                 Err(source) => Err(ObserveError::Shape { id, source }),
             }
         };
@@ -76,7 +76,7 @@ impl Puzzle {
         }
         let mut extractor = isthmus::Extractor::default();
         let extract = |(id, cutout): (&&str, &mask::Cutout)| match extractor.extract(cutout) {
-            Ok(features) => Ok(Piece { id: (*id).to_owned(), features }),
+            Ok(features) => Ok(Piece { id: (*id).to_owned(), seen: 0, features }),
             Err(source) => Err(ObserveError::Shape { id: (*id).to_owned(), source }),
         };
         ids.iter().zip(&cutouts).map(extract).collect()

@@ -283,7 +283,7 @@ fn the_truth_itself_has_a_perfect_score() {
                 endoskeleton: Default::default(),
                 exoskeleton: Default::default(),
             };
-            crate::Piece { id: puzzle.pieces()[k].id.clone(), features }
+            crate::Piece { id: puzzle.pieces()[k].id.clone(), seen: 0, features }
         })
         .collect();
     // The whole assembly may lie anywhere.
