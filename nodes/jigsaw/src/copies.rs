@@ -71,7 +71,7 @@ fn alike_in_reach(a: &Outline, b: &Outline) -> bool {
     /// Where few points lie between two quantiles, sampling adds this many times what the border is off.
     const SPARSE: f64 = 3.0;
     let tolerance = (SPARSE * sameness(a, b)) as f32;
-    a.reaches.iter().zip(&b.reaches).all(|(p, q)| (p - q).abs() <= tolerance)
+    a.reaches().iter().zip(b.reaches()).all(|(p, q)| (p - q).abs() <= tolerance)
 }
 
 /// The pose that lays one outline on the other best, if they are one shape.

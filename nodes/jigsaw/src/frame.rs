@@ -9,6 +9,7 @@
 use crate::outline::{Outline, convex_hull};
 use isthmus::Point;
 use nalgebra::{Isometry2, Translation2, UnitComplex, Vector2};
+use rayon::prelude::*;
 use std::f64::consts::{FRAC_PI_2, PI};
 
 /// Straight edges decide if their length is at least this part of half the hull's perimeter.
@@ -52,8 +53,8 @@ fn hull(outlines: &[&Outline], poses: &[Isometry2<f64>], members: &[usize]) -> V
         let (at, radius) = (centre(k), outlines[k].radius);
         sides.len() > 2 && sides.iter().all(|(p, along)| along.perp(&(at - p)) >= radius)
     };
-    let outer = members.iter().filter(|k| !within(**k));
-    convex_hull(outer.flat_map(|k| outlines[*k].hull.iter().map(move |p| poses[*k] * p)).collect())
+    let outer = members.par_iter().filter(|k| !within(**k));
+    convex_hull(outer.flat_map_iter(|k| outlines[*k].hull().iter().map(move |p| poses[*k] * p)).collect())
 }
 
 /// Least and greatest coordinates of turned points.

@@ -7,7 +7,7 @@ use crate::Piece;
 use isthmus::isthmus::{Isthmus, Polarity};
 use isthmus::{Point, hull};
 use nalgebra::Vector2;
-use std::sync::LazyLock;
+use std::sync::{LazyLock, OnceLock};
 
 /// Samples of an IDF in the shape index: enough for a tab (its finest feature is about a tenth of its path).
 pub(crate) const SHAPE_SAMPLES: usize = 64;
@@ -128,14 +128,14 @@ pub(crate) struct Outline {
     pub(crate) centroid: Point,
     /// Greatest distance of a border point from the centroid.
     pub(crate) radius: f64,
-    /// Quantiles of the distances of border points from the centroid.
-    pub(crate) reaches: [f32; REACHES],
+    /// See [`Outline::reaches`].
+    reaches: OnceLock<[f32; REACHES]>,
     pub(crate) noise: f64,
     pub(crate) tabs: Vec<Segment>,
     pub(crate) mouths: Vec<Segment>,
     pub(crate) straights: Vec<Straight>,
-    /// Convex hull.
-    pub(crate) hull: Vec<Point>,
+    /// See [`Outline::hull`].
+    hull: OnceLock<Vec<Point>>,
     pub(crate) raster: Raster,
 }
 
@@ -148,8 +148,8 @@ impl Outline {
         let mut twice_area = 0.0;
         let mut moment = Vector2::zeros();
         let origin = points[0];
-        for i in 0..n {
-            let (a, b) = (points[i] - origin, points[(i + 1) % n] - origin);
+        for (a, b) in points.iter().zip(points.iter().cycle().skip(1)) {
+            let (a, b) = (a - origin, b - origin);
             let cross = a.x * b.y - a.y * b.x;
             twice_area += cross;
             moment += (a + b) * cross;
@@ -158,20 +158,17 @@ impl Outline {
         let centroid = if twice_area.abs() > f64::EPSILON { origin + moment / (3.0 * twice_area) } else { origin };
         let normals: Vec<Vector2<f32>> = (0..n)
             .map(|i| {
-                let d = points[(i + 1) % n] - points[(i + n - 1) % n];
+                let d = points[if i + 1 < n { i + 1 } else { 0 }] - points[if i > 0 { i - 1 } else { n - 1 }];
                 let length = d.norm().max(f64::EPSILON);
                 Vector2::new((d.y / length) as f32, (-d.x / length) as f32)
             })
             .collect();
-        let mut distances: Vec<f64> = points.iter().map(|p| (p - centroid).norm()).collect();
-        distances.sort_by(f64::total_cmp);
-        let radius = distances[n - 1];
-        let reaches = std::array::from_fn(|k| distances[(2 * k + 1) * n / (2 * REACHES)] as f32);
+        let radius = points.iter().map(|p| (p - centroid).norm_squared()).fold(0.0, f64::max).sqrt();
         let mut outline = Self {
             serial,
             seen: piece.seen,
             raster: Raster::new(&points, area.sqrt() / RASTER_CELLS),
-            hull: convex_hull(points.clone()),
+            hull: OnceLock::new(),
             points,
             normals,
             spacing,
@@ -180,7 +177,7 @@ impl Outline {
             scale: area.sqrt(),
             centroid,
             radius,
-            reaches,
+            reaches: OnceLock::new(),
             noise: piece.features.noise.max(0.0),
             tabs: Vec::new(),
             mouths: Vec::new(),
@@ -200,11 +197,31 @@ impl Outline {
         outline
     }
 
+    /// Convex hull; few pieces are asked for theirs.
+    pub(crate) fn hull(&self) -> &[Point] {
+        self.hull.get_or_init(|| convex_hull(self.points.clone()))
+    }
+
+    /// Quantiles of the distances of border points from the centroid; few pieces are asked for theirs.
+    pub(crate) fn reaches(&self) -> &[f32; REACHES] {
+        self.reaches.get_or_init(|| {
+            let n = self.points.len();
+            let mut distances: Vec<f64> = self.points.iter().map(|p| (p - self.centroid).norm()).collect();
+            distances.sort_unstable_by(f64::total_cmp);
+            std::array::from_fn(|k| distances[(2 * k + 1) * n / (2 * REACHES)] as f32)
+        })
+    }
+
     /// Border point at an index that may lie outside `0..n`.
     fn at(&self, index: i64) -> Point {
+        self.points[self.wrapped(index)]
+    }
+
+    /// The index of a border point, once round or more taken off.
+    fn wrapped(&self, index: i64) -> usize {
         // To divide takes longer than to look whether it has to be done.
         let n = self.points.len() as i64;
-        self.points[if (0..n).contains(&index) { index } else { index.rem_euclid(n) } as usize]
+        (if (0..n).contains(&index) { index } else { index.rem_euclid(n) }) as usize
     }
 
     /// Point at an arc length from the first border point.
@@ -293,12 +310,11 @@ impl Outline {
         let thin = if tab { ((last - first) as usize / SHAPE_SAMPLES).max(1) as i64 } else { 1 };
         let n = self.points.len() as i64;
         let begin = first - before / thin * thin;
-        let run: Vec<Node> = (0..)
-            .map(|k| begin + k * thin)
-            .take_while(|i| *i <= last + after && *i < begin + n)
+        let run: Vec<Node> = (begin..=(last + after).min(begin + n - 1))
+            .step_by(thin as usize)
             .map(|i| {
-                let p = self.at(i) - isthmus.point;
-                let normal = self.normals[i.rem_euclid(n) as usize];
+                let i = self.wrapped(i);
+                let (p, normal) = (self.points[i] - isthmus.point, self.normals[i]);
                 Node { x: p.x as f32, y: p.y as f32, nx: normal.x, ny: normal.y }
             })
             .collect();
@@ -323,7 +339,7 @@ impl Outline {
             }),
             leans: arcs.map(|arcs| {
                 arcs.map(|arc| {
-                    let normal = self.normals[((arc / self.spacing).round() as i64).rem_euclid(n) as usize];
+                    let normal = self.normals[self.wrapped((arc / self.spacing).round() as i64)];
                     [normal.x, normal.y]
                 })
             }),
@@ -381,10 +397,13 @@ impl Outline {
         let is_straight = |from: i64, to: i64| {
             let (a, b) = (self.at(from), self.at(to));
             let Some(d) = (b - a).try_normalize(f64::EPSILON) else { return false };
-            (from..=to).step_by(stride as usize).all(|i| {
+            let is_near = |i: i64| {
                 let p = self.at(i) - a;
                 (p.x * d.y - p.y * d.x).abs() <= tolerance
-            })
+            };
+            // Most runs bend, and leave their chord in the middle.
+            is_near(from + (to - from) / (2 * stride) * stride)
+                && (0..=(to - from) / stride).all(|k| is_near(from + k * stride))
         };
         let mut found: Vec<(i64, i64)> = Vec::new();
         let mut i = 0;
@@ -485,6 +504,8 @@ impl Raster {
         let rows = ((high.y - low.y) / cell + 2.0 * MARGIN) as usize + 1;
         let centre =
             |c: usize, r: usize| Point::new(origin.x + (c as f64 + 0.5) * cell, origin.y + (r as f64 + 0.5) * cell);
+        let xs: Vec<f64> = (0..columns).map(|c| centre(c, 0).x).collect();
+        let ys: Vec<f64> = (0..rows).map(|r| centre(0, r).y).collect();
         // A rim of cells that know no border point spares the sweeps a look at where the raster ends.
         let width = columns + 2;
         let place = |c: usize, r: usize| (r + 1) * width + c + 1;
@@ -498,47 +519,63 @@ impl Raster {
                 (square[k], nearest[k]) = (d, i as u32);
             }
         }
-        let mut relax = |c: usize, r: usize, beside: &[usize]| {
-            let (k, p) = (place(c, r), centre(c, r));
-            for other in beside {
-                // What lies before is so many cells behind, once round.
-                let other = nearest[k.wrapping_add(*other)];
-                if other == u32::MAX || other == nearest[k] {
-                    continue;
-                }
-                let d = (p - points[other as usize]).norm_squared();
-                if d < square[k] {
-                    (square[k], nearest[k]) = (d, other);
+        // The border point next to a cell and its distance, given those that cells beside it know.
+        let relax = |p: Point, known: (u32, f64), beside: &[u32]| {
+            beside.iter().fold(known, |(near, least), other| {
+                let Some(point) = points.get(*other as usize).filter(|_| *other != near) else { return (near, least) };
+                let d = (p - point).norm_squared();
+                if d < least { (*other, d) } else { (near, least) }
+            })
+        };
+        for downwards in [true, false] {
+            for step in 0..rows {
+                let r = if downwards { step } else { rows - 1 - step };
+                let (above, rest) = nearest.split_at_mut((r + 1) * width);
+                let (here, below) = rest.split_at_mut(width);
+                let (above, below) = (&above[r * width..], &below[..width]);
+                let here_square = &mut square[(r + 1) * width..(r + 2) * width];
+                let mut see = |c: usize, beside: &[u32], here: &mut [u32]| {
+                    let known = (here[c + 1], here_square[c + 1]);
+                    (here[c + 1], here_square[c + 1]) = relax(Point::new(xs[c], ys[r]), known, beside);
+                };
+                if downwards {
+                    for c in 0..columns {
+                        see(c, &[here[c], above[c + 1], above[c], above[c + 2]], here);
+                    }
+                    (0..columns).rev().for_each(|c| see(c, &[here[c + 2]], here));
+                } else {
+                    for c in (0..columns).rev() {
+                        see(c, &[here[c + 2], below[c + 1], below[c + 2], below[c]], here);
+                    }
+                    (0..columns).for_each(|c| see(c, &[here[c]], here));
                 }
             }
-        };
-        let [left, above] = [1, width].map(usize::wrapping_neg);
-        for r in 0..rows {
-            (0..columns).for_each(|c| relax(c, r, &[left, above, above.wrapping_add(left), above.wrapping_add(1)]));
-            (0..columns).rev().for_each(|c| relax(c, r, &[1]));
-        }
-        for r in (0..rows).rev() {
-            (0..columns).rev().for_each(|c| relax(c, r, &[1, width, width + 1, width - 1]));
-            (0..columns).for_each(|c| relax(c, r, &[left]));
         }
         let nearest: Vec<u32> =
             nearest.chunks(width).skip(1).take(rows).flat_map(|row| &row[1..=columns]).copied().collect();
         // Which side a cell lies on is counted, not told from the nearest normal: beyond a corner that is ambiguous.
         let mut crossings: Vec<Vec<f64>> = vec![Vec::new(); rows];
-        for (i, a) in points.iter().enumerate() {
-            let b = points[(i + 1) % points.len()];
-            let row = |y: f64| ((y - origin.y) / cell - 0.5).ceil().max(0.0) as usize;
-            for (r, list) in crossings.iter_mut().enumerate().take(row(a.y.max(b.y))).skip(row(a.y.min(b.y))) {
-                list.push(a.x + (b.x - a.x) * ((centre(0, r).y - a.y) / (b.y - a.y)));
+        // The first row whose centres lie at this height or below.
+        let row = |y: f64| {
+            let exact = (y - origin.y) / cell - 0.5;
+            let whole = exact as usize;
+            whole + usize::from(exact > whole as f64)
+        };
+        let mut from = row(points[0].y);
+        for (a, b) in points.iter().zip(points.iter().cycle().skip(1)) {
+            let to = row(b.y);
+            for r in from.min(to)..from.max(to).min(rows) {
+                crossings[r].push(a.x + (b.x - a.x) * ((ys[r] - a.y) / (b.y - a.y)));
             }
+            from = to;
         }
         let mut distance = vec![0f32; columns * rows];
         for (r, list) in crossings.iter_mut().enumerate() {
             list.sort_by(f64::total_cmp);
             let mut passed = 0;
-            for c in 0..columns {
+            for (c, x) in xs.iter().enumerate() {
                 let k = r * columns + c;
-                let p = centre(c, r);
+                let p = Point::new(*x, ys[r]);
                 while list.get(passed).is_some_and(|x| *x < p.x) {
                     passed += 1;
                 }
