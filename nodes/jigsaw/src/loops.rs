@@ -423,8 +423,9 @@ impl Closure {
     pub(crate) fn fit(guess: &Self, found: &[Loop], decoys: &Decoys) -> Self {
         /// Each scale tried is this factor wider than the one before.
         const FINENESS: f64 = 1.35;
-        /// How far (natural logarithm) the guess may be off: real pieces close ten times as wide as their borders' noise.
-        const GUESS_DEVIATION: f64 = 1.2;
+        /// How far (natural logarithm) the guess may be off: by 0.4 in the mean (root of squares) of whole sets, real and
+        /// generated, and by more in heaps of few joints.
+        const GUESS_DEVIATION: f64 = 1.0;
         /// How far decoys may be off: what is among the candidates resembles the right piece more than any stranger.
         const DECOY_DEVIATION: f64 = 0.7;
         /// Decoys exchange the two pieces on the ways; any of the four of a loop may be wrong.

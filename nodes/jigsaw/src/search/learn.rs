@@ -15,8 +15,13 @@ use crate::slots::{Slot, Slots};
 /// Loops of refined poses close to within this on real pieces (0.8 % and 0.44° measured); calibration tightens it.
 const LOOSE: Tolerance = Tolerance { position: 0.04, angle: 0.05 };
 /// True loops close this many times as wide as the borders' residuals say, as a first guess: neighbouring residuals
-/// are alike (1 to 2 on generated pieces, 4 to 12 on real ones, which don't keep their shape exactly).
-const STIFFNESS: f64 = 3.0;
+/// are alike (1 to 3.5 on generated pieces).
+const STIFFNESS: f64 = 2.0;
+/// Real pieces don't keep their shape: however small their residuals are, loops close as if these were this part of a piece
+/// scale (0.0055 to 0.0126 on five sets, 3 to 13 times the residuals).
+const BENT: f64 = 0.008;
+/// Residuals up to so many times the borders' noise don't show that: noise alone leaves up to 1.3 times.
+const NOISY: f64 = 2.0;
 /// A heap of pieces that all have a candidate standing out has true loops, before anything is seen of them: the natural
 /// logarithm of the odds.
 const LOOPS: f64 = 3.0;
@@ -108,7 +113,8 @@ impl Assembler<'_> {
         loops::Ways::new((&self.edges, &active), (self.outlines, &self.slots), LOOSE)
     }
 
-    /// How loops should close, by the residuals of the best candidates and the tolerance of the search.
+    /// How loops should close: by the residuals of the best candidates, as far as these are more than noise by the piece scale,
+    /// and by the tolerance of the search.
     fn first_guess(&self) -> Closure {
         let best = self.edges.iter().filter(|e| e.mouth_rank == 0);
         let residual = median(&mut best.clone().map(|e| e.cost.exp()).collect::<Vec<f64>>()).unwrap_or(1.0);
@@ -119,7 +125,9 @@ impl Assembler<'_> {
         // The fewer mouths have a candidate that stands out, the less is there to make loops of, or to tell them by.
         let mouths = self.edges.iter().filter(|e| e.mouth_rank == 0).count();
         let outstanding = (self.outstanding().len() as f64 + 1.0) / (mouths as f64 + 1.0);
-        Closure::guess(STIFFNESS * residual, (volume / open).cbrt(), LOOPS + outstanding.ln())
+        let bent = (1.0 - (NOISY * self.prior.noise / residual).powi(2)).max(0.0).sqrt();
+        let narrow = (STIFFNESS * residual).hypot(bent * BENT * self.scale);
+        Closure::guess(narrow, (volume / open).cbrt(), LOOPS + outstanding.ln())
     }
 
     /// Counts what supports what, leaves out loops that are more likely chance, and puts the best first.
