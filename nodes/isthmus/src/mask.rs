@@ -12,7 +12,8 @@
 //! 4. *Pixels*: about each component the frame is cut out, in a form in which half-way between two fixed levels is half-way
 //!    between the shape's own level near the border and the ground's: as it is, where both are uniform, else
 //!    divided by the local contrast. Pixels beyond half-way are joined to components once more: neighbours whose shadows
-//!    or glow met come apart. Where a part of the border is soft, it is sought within the shadow that makes it so ([`Segmentation::shaded`]). Threads that hang on a shape (hairs) are taken off.
+//!    or glow met come apart. Where a part of the border is soft, it is sought within the shadow that makes it so ([`Segmentation::shaded`]). Print that comes
+//!    near the ground's level belongs to the shape where its edge to the ground is crisp. Threads that hang on a shape (hairs) are taken off.
 //! 5. *Rejection*, each with its [`Reason`]: cut by the frame's edge, too small beside the others, thread-like (hairs,
 //!    scanner edges), soft beside sharp ones or faint without a crisp edge (glare), convex beside such with bays (coins, labels, rulers), two shapes that touch (of about twice the usual area, with an isthmus between the halves; it is a waist where most large shapes have none). Where that
 //!    isthmus is too narrow to be the neck of one of them they are cut apart instead ([`Segmentation::separated`]).
@@ -43,6 +44,7 @@ mod frame;
 mod ground;
 mod levels;
 mod metric;
+mod print;
 mod runs;
 mod segmentation;
 mod shadows;
@@ -59,6 +61,7 @@ pub use segmentation::{MIN_REPORTED_AREA, Parameters, Reason, Rejected, Segmenta
 use blocks::Blocks;
 use crop::Crop;
 use ground::Ground;
+use print::Print;
 use runs::Components;
 use shadows::Shadows;
 use sift::{Found, sift};
@@ -83,6 +86,7 @@ pub struct Segmenter {
     crop: Crop,
     threads: Threads,
     shadows: Shadows,
+    print: Print,
 }
 
 impl Segmenter {
@@ -162,7 +166,8 @@ impl Segmenter {
             self.crop.take(frame, &standing, k);
             self.crop.label(&mut self.fine);
             let shaded = self.crop.lift_shadows(&self.fine, &mut self.shadows, parameters);
-            if shaded {
+            let recovered = self.crop.is_print && self.crop.recover_print(frame, &standing, k, &mut self.print);
+            if shaded || recovered {
                 self.crop.label(&mut self.fine);
             }
             if self.crop.erase_threads(&self.fine, &mut self.threads, parameters) {

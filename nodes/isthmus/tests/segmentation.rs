@@ -197,6 +197,47 @@ fn a_table_of_wood() {
     }
 }
 
+/// Pieces with print in stripes, the ends of which (tabs, corners) have a seventh of the contrast: they belong to the pieces. What has as little contrast beside them, but rises slowly
+/// from the ground, does not.
+#[test]
+fn print_near_the_level_of_the_ground() {
+    const GROUND: [f64; 3] = [40.0, 45.0, 50.0];
+    const STRIPES: [[f64; 3]; 3] = [[220.0, 200.0, 90.0], [150.0, 60.0, 70.0], [90.0, 170.0, 210.0]];
+    const DARK: [f64; 3] = [58.0, 42.0, 68.0];
+    let (coverage, necks) = coverage();
+    let mut glow = vec![0.0; coverage.len()];
+    for (k, (x, y)) in CENTRES.into_iter().enumerate().filter(|(k, _)| k % 2 == 1) {
+        let (x, y) = (x - 0.45 * SIZE, y - 0.45 * SIZE);
+        let about = |at: usize| ((at % SIDE) as f64 - x).hypot((at / SIDE) as f64 - y);
+        glow.iter_mut()
+            .enumerate()
+            .for_each(|(at, g)| *g += (20.0 + k as f64) * (1.0 - (about(at) / 60.0).powi(2)).max(0.0));
+    }
+    for glow_part in [0.0, 1.0] {
+        let mut rng = StdRng::seed_from_u64(12);
+        let mut pixels = Vec::with_capacity(3 * coverage.len());
+        for (k, c) in coverage.iter().enumerate() {
+            let (x, y) = ((k % SIDE) as f64, (k / SIDE) as f64);
+            let middle = CENTRES.into_iter().min_by(|a, b| {
+                let far = |(u, v): (f64, f64)| (x - u).hypot(y - v);
+                far(*a).total_cmp(&far(*b))
+            });
+            let (u, v) = middle.unwrap();
+            let print = if x - u > 0.36 * SIZE {
+                DARK
+            } else {
+                STRIPES[(((x + y - u - v) / 50.0).floor() as i64).rem_euclid(3) as usize]
+            };
+            for (ground, print) in GROUND.into_iter().zip(print) {
+                let level = (ground + glow_part * glow[k]) * (1.0 - c) + print * c + 2.0 * normal(&mut rng);
+                pixels.push(level.round().clamp(0.0, 255.0) as u8);
+            }
+        }
+        let frame = Frame::rgb(SIDE as u32, SIDE as u32, &pixels).unwrap();
+        check(&segment(&frame, &Parameters::default()), &necks, &format!("print, glow {glow_part}"));
+    }
+}
+
 /// Light that falls off to the left and to all corners: the brightest ground has five times the level of the darkest, pieces three
 /// quarters of that of the ground round them. No level tells the two apart.
 #[test]

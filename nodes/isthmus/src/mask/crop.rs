@@ -45,15 +45,18 @@ pub(super) struct Crop {
     pub(super) noise_level: f32,
     /// Contrast in the grey levels of the frame.
     pub(super) contrast: f32,
+    /// Whether that is one of print, block by block.
+    pub(super) is_print: bool,
 }
 
 impl Crop {
     /// Cuts a component's surroundings out of the frame.
     pub(super) fn take(&mut self, frame: &Frame<'_>, standing: &Standing<'_>, k: usize) {
         let Standing { blocks, ground, components, owner } = *standing;
-        let c = components.list[k];
         let (block, columns) = (blocks.size, blocks.columns);
         let levels = Levels::of(standing, k);
+        self.is_print = levels.is_print();
+        let c = if self.is_print { standing.reach(k) } else { components.list[k] };
         let margin = MARGIN + block;
         let mut rows = RowSource { frame, ground, block, lines: Default::default() };
         (self.x, self.y) = ((c.left * block) as i32 - margin as i32, (c.top * block) as i32 - margin as i32);

@@ -47,6 +47,11 @@ impl Ground {
         self.difference([column as f64, row as f64], hue, |c| clipping.level(blocks.planes[c][block]))
     }
 
+    /// What differs from the ground by more than this is no ground, whatever it is: shadows, glow, or print.
+    pub(super) fn weak_threshold(&self) -> f32 {
+        (OUTLIER * self.scatter).max(MIN_RESIDUAL)
+    }
+
     /// The direction in which blocks of a colour frame differ from the ground, on the middle: that in which what the ground scatters by counts least
     /// (R. A. Fisher, *The use of multiple measurements in taxonomic problems*, 1936).
     pub(super) fn hue(&self, blocks: &Blocks, list: &[(usize, usize)]) -> Option<Hue> {
@@ -144,6 +149,15 @@ impl GroundRow<'_> {
     /// The levels of a grey frame's ground.
     pub(super) fn grey(&self) -> Option<AlongRow> {
         (self.channels == 1).then_some(self.levels[0])
+    }
+
+    /// The difference of the pixel so many steps along the row from the ground, channel by channel, in the metric.
+    pub(super) fn difference(&self, steps: usize, pixel: &[u8]) -> [f32; MAX_CHANNELS] {
+        let mut difference = [0.0; MAX_CHANNELS];
+        for (difference, (level, ground)) in difference.iter_mut().zip(pixel.iter().zip(&self.levels)) {
+            *difference = f32::from(*level) - ground.at(steps);
+        }
+        self.metric.map_or(difference, |metric| metric.whiten(difference))
     }
 
     /// Fills a row with its signed differences from the ground in the direction of a hue, from its pixels.

@@ -327,6 +327,11 @@ impl Levels {
         matches!(self.course, Course::Uniform)
     }
 
+    /// Whether it takes a map of blocks.
+    pub(super) fn is_print(&self) -> bool {
+        matches!(self.course, Course::Map(_))
+    }
+
     /// Spreads the levels of the inner blocks out over the box, each block taking the mean of its neighbours that have a level;
     /// none stays below `least`. `noise` is the standard deviation of a block's level as a part of the contrast.
     fn spread_out(&self, mut map: Vec<f32>, least: f32, reach: usize, noise: f32) -> Vec<f32> {
@@ -461,7 +466,7 @@ fn divide_row(
 }
 
 /// A place in blocks, from one in pixels: block k has its centre at pixel `k * block + (block - 1) / 2`.
-fn in_blocks(pixel: usize, block: usize) -> f64 {
+pub(super) fn in_blocks(pixel: usize, block: usize) -> f64 {
     (pixel as f64 - (block - 1) as f64 / 2.0) / block as f64
 }
 

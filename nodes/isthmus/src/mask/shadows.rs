@@ -311,7 +311,7 @@ impl Shadows {
 }
 
 /// The four neighbours of a pixel, as many as there are.
-fn neighbours(k: usize, width: usize, height: usize) -> impl Iterator<Item = usize> {
+pub(super) fn neighbours(k: usize, width: usize, height: usize) -> impl Iterator<Item = usize> {
     let (x, y) = (k % width, k / width);
     let list = [
         (x > 0, k.wrapping_sub(1)),
@@ -323,7 +323,7 @@ fn neighbours(k: usize, width: usize, height: usize) -> impl Iterator<Item = usi
 }
 
 /// Means over squares of `2 radius + 1` pixels; beyond the rim it is as along the rim.
-fn box_mean(levels: &[f32], [width, height]: [usize; 2], radius: usize) -> Vec<f32> {
+pub(super) fn box_mean(levels: &[f32], [width, height]: [usize; 2], radius: usize) -> Vec<f32> {
     let pass = |from: &[f32], [count, stride]: [usize; 2], [lines, line_stride]: [usize; 2]| {
         let mut to = vec![0.0; from.len()];
         for begin in (0..lines).map(|line| line * line_stride) {

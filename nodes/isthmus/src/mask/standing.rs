@@ -2,7 +2,7 @@
 
 use super::blocks::Blocks;
 use super::ground::Ground;
-use super::runs::{Components, Run};
+use super::runs::{Component, Components, Run};
 use std::ops::Range;
 
 /// Owner of the blocks that belong to no component.
@@ -64,6 +64,39 @@ impl Standing<'_> {
         let blocks = begin + columns.start..begin + columns.end;
         let owners = self.owner[blocks.clone()].iter();
         owners.zip(&self.ground.residual[blocks]).map(move |(owner, r)| (*owner == k as u32) & (*r > threshold))
+    }
+
+    /// The box of a component with what hangs together with it and is no ground either, unless it belongs to another one; at most half the
+    /// box's longer side beyond it.
+    pub(super) fn reach(&self, k: usize) -> Component {
+        let (columns, rows) = (self.blocks.columns, self.blocks.rows);
+        let weak = self.ground.weak_threshold();
+        let is_of = |block: usize| {
+            let owner = self.owner[block];
+            self.ground.residual[block] > weak && (owner == NOBODY || owner == k as u32)
+        };
+        let mut reach = self.components.list[k];
+        let most = (reach.right - reach.left).max(reach.bottom - reach.top) / 2;
+        let within = |from: usize, to: usize, count: usize| from.saturating_sub(most)..count.min(to + most);
+        let (across, down) = (within(reach.left, reach.right, columns), within(reach.top, reach.bottom, rows));
+        let at = |column: usize, row: usize| (row - down.start) * across.len() + column - across.start;
+        let mut known = vec![false; across.len() * down.len()];
+        let runs = self.components.runs_of(k);
+        let mut open: Vec<(usize, usize)> =
+            runs.flat_map(|run| (run.start..run.end).map(|column| (column, run.row))).collect();
+        open.iter().for_each(|(column, row)| known[at(*column, *row)] = true);
+        while let Some((column, row)) = open.pop() {
+            (reach.left, reach.right) = (reach.left.min(column), reach.right.max(column + 1));
+            (reach.top, reach.bottom) = (reach.top.min(row), reach.bottom.max(row + 1));
+            for v in row.saturating_sub(1).max(down.start)..down.end.min(row + 2) {
+                for u in column.saturating_sub(1).max(across.start)..across.end.min(column + 2) {
+                    if is_of(v * columns + u) && !std::mem::replace(&mut known[at(u, v)], true) {
+                        open.push((u, v));
+                    }
+                }
+            }
+        }
+        reach
     }
 
     /// How many blocks deep within a component each block of its box lies (1 along its border, 0 outside of it), up to
