@@ -51,7 +51,8 @@ impl<'a> AssemblyFile<'a> {
             clearance_px: mating.clearance,
             confidence: mating.confidence,
         });
-        let mut unplaced: Vec<&str> = assembly.unplaced.iter().map(|&piece| pieces[piece].id.as_str()).collect();
+        let unplaced = assembly.unplaced.iter().chain(&assembly.earlier);
+        let mut unplaced: Vec<&str> = unplaced.map(|&piece| pieces[piece].id.as_str()).collect();
         unplaced.sort_unstable();
         Self { pieces: placed, matings: matings.collect(), unplaced, table: assembly.table, seconds }
     }

@@ -135,13 +135,14 @@ impl Solution {
             clearance: (mating.clearance * plane.metres_per_pixel) as f32,
             confidence: mating.confidence as f32,
         });
+        let left = self.assembly.unplaced.iter().chain(&self.assembly.earlier);
         let table = &self.assembly.table;
         AssemblyMessage {
             header: self.header(),
             state: self.state(),
             table_frame: self.naming.table_frame.clone(),
             pieces,
-            unplaced: self.assembly.unplaced.iter().map(|&piece| self.id(piece)).collect(),
+            unplaced: left.map(|&piece| self.id(piece)).collect(),
             matings: matings.collect(),
             table: CandidateCounts {
                 positive: count(table.positive),
