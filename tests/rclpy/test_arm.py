@@ -1,5 +1,5 @@
-"""An arm that follows the cell puts a puzzle together: its motions are done to the pieces in a picture of the table, where
-somebody has moved one meanwhile."""
+"""An arm that follows the cell puts a puzzle together: its motions are done to the pieces in a picture of the table,
+where somebody has moved one meanwhile."""
 
 import json
 import math
@@ -81,7 +81,9 @@ def test_what_the_arm_is_told_puts_the_puzzle_together(launcher, ros, domain, ge
         camera, looker = Camera(ros), Arm(ros, name="looker")
 
         def show(second, picture, new):
-            ids = lambda: {features.id for features in camera.features.get(second, [])}
+            def ids():
+                return {features.id for features in camera.features.get(second, [])}
+
             camera.show(image_message(picture, Time(sec=second)), seen=lambda: len(ids()) >= new)
             ros.until(lambda: all(map(looker.knows, ids())), f"assembly with what is new in picture {second}")
 
