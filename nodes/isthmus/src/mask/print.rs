@@ -334,18 +334,22 @@ impl Print {
 
     /// Where two borders are apart by more than a pixel or two, and about there.
     fn is_elsewhere(&self, a: &[f32], b: &[f32]) -> Vec<bool> {
-        let between: Vec<f32> = a.iter().zip(b).map(|(a, b)| f32::from(u8::from((*a > 0.5) != (*b > 0.5)))).collect();
-        let shares = box_mean(&between, [self.width, self.height], APART);
-        let apart: Vec<bool> = shares.into_iter().map(|share| share > LEAST_APART).collect();
+        let between: Vec<bool> = a.iter().zip(b).map(|(a, b)| (*a > 0.5) != (*b > 0.5)).collect();
+        let apart: Vec<bool> = self.shares(&between, APART).map(|share| share > LEAST_APART).collect();
         self.dilated(&apart, BEYOND)
+    }
+
+    /// Which part of the square about each pixel is set.
+    fn shares(&self, set: &[bool], radius: usize) -> impl Iterator<Item = f32> + use<> {
+        let levels: Vec<f32> = set.iter().map(|set| f32::from(u8::from(*set))).collect();
+        box_mean(&levels, [self.width, self.height], radius).into_iter()
     }
 
     /// What is within so many rows and columns of what is set.
     fn dilated(&self, set: &[bool], radius: usize) -> Vec<bool> {
-        let levels: Vec<f32> = set.iter().map(|set| f32::from(u8::from(*set))).collect();
         // Half a pixel: means are no exact numbers.
         let least = 0.5 / (2 * radius + 1).pow(2) as f32;
-        box_mean(&levels, [self.width, self.height], radius).into_iter().map(|share| share > least).collect()
+        self.shares(set, radius).map(|share| share > least).collect()
     }
 
     /// What is farther than so many rows and columns from what is not set.
