@@ -447,8 +447,9 @@ fn a_goal_succeeds_when_every_expected_piece_is_placed() {
 #[test]
 fn what_is_left_over_spoils_no_puzzle_of_known_size() {
     let other = Puzzle::generate(&Options { rows: 2, columns: 3, seed: 12, ..Options::default() }).unwrap();
-    let mut frames = raw_frames(&puzzle());
-    frames.push(Frame::Raw(TOPIC.to_owned(), camera_image(&other, 0, Time { sec: 9, nanosec: 0 })));
+    // Shown first, for a goal ends as soon as the expected pieces are placed.
+    let mut frames = vec![Frame::Raw(TOPIC.to_owned(), camera_image(&other, 0, Time { sec: 9, nanosec: 0 }))];
+    frames.extend(raw_frames(&puzzle()));
     let health = health();
     let features = run_feature(run_capture(frames, Vec::new(), &health), &health);
     let state = run_solver(features.clone(), Vec::new(), &health).assemblies.last().unwrap().state;
