@@ -51,8 +51,7 @@ impl<'a> AssemblyFile<'a> {
             clearance_px: mating.clearance,
             confidence: mating.confidence,
         });
-        let unplaced = assembly.unplaced.iter().chain(&assembly.earlier);
-        let mut unplaced: Vec<&str> = unplaced.map(|&piece| pieces[piece].id.as_str()).collect();
+        let mut unplaced: Vec<&str> = assembly.without_place().map(|piece| pieces[piece].id.as_str()).collect();
         unplaced.sort_unstable();
         Self { pieces: placed, matings: matings.collect(), unplaced, table: assembly.table, seconds }
     }

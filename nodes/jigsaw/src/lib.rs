@@ -114,6 +114,13 @@ pub struct Assembly {
     pub timings: Timings,
 }
 
+impl Assembly {
+    /// All pieces that have no place: those left over, then the earlier sightings.
+    pub fn without_place(&self) -> impl Iterator<Item = usize> {
+        self.unplaced.iter().chain(&self.earlier).copied()
+    }
+}
+
 /// Wall-clock seconds of the solver's stages.
 #[derive(Debug, Clone, Copy, PartialEq, Default, serde::Serialize)]
 pub struct Timings {

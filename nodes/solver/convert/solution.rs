@@ -135,14 +135,13 @@ impl Solution {
             clearance: (mating.clearance * plane.metres_per_pixel) as f32,
             confidence: mating.confidence as f32,
         });
-        let left = self.assembly.unplaced.iter().chain(&self.assembly.earlier);
         let table = &self.assembly.table;
         AssemblyMessage {
             header: self.header(),
             state: self.state(),
             table_frame: self.naming.table_frame.clone(),
             pieces,
-            unplaced: left.map(|&piece| self.id(piece)).collect(),
+            unplaced: self.assembly.without_place().map(|piece| self.id(piece)).collect(),
             matings: matings.collect(),
             table: CandidateCounts {
                 positive: count(table.positive),
