@@ -488,17 +488,18 @@ impl Tracer {
     }
 }
 
-/// Copies a cutout with a margin of ground where shape touches its rim; gives the margin.
+/// Copies a cutout with a margin of ground where shape comes near its rim; gives the margin.
 fn pad(cutout: &Cutout, level: f32, padded: &mut Vec<u8>) -> usize {
     /// Wide enough for the blur of an aliased picture.
     const MARGIN: usize = 4;
+    /// Rows and columns along the rim that must be ground: those that make one at half the resolution.
+    const RIM: usize = 2;
     let (width, height) = (cutout.window.width as usize, cutout.window.height as usize);
     let bright = cutout.shape_level > cutout.ground_level;
     let inside = |p: &u8| (f32::from(*p) > level) == bright;
     let rows = || cutout.pixels.chunks_exact(width.max(1));
-    let touches = rows().next().is_some_and(|r| r.iter().any(inside))
-        || rows().next_back().is_some_and(|r| r.iter().any(inside))
-        || rows().any(|r| r.first().is_some_and(inside) || r.last().is_some_and(inside));
+    let touches = rows().take(RIM).chain(rows().rev().take(RIM)).any(|r| r.iter().any(inside))
+        || rows().any(|r| r.iter().take(RIM).chain(r.iter().rev().take(RIM)).any(inside));
     if !touches {
         return 0;
     }

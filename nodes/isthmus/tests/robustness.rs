@@ -171,6 +171,11 @@ fn cutouts_that_make_no_sense() {
         if let Ok((border, noise)) = Border::from_cutout(&full) {
             assert!(noise.is_finite() && (border.area() - 400.0).abs() < 60.0, "{noise_level}: {}", border.area());
         }
+        // One that begins right behind the window's rim touches it at half the resolution.
+        let is_shape = |k: usize| (4..16).contains(&(k % 20)) && (1..15).contains(&(k / 20));
+        let pixels = (0..400).map(|k| if is_shape(k) { 255 } else { 0 }).collect();
+        let (border, noise) = Border::from_cutout(&Cutout { pixels, noise_level, ..good.clone() }).unwrap();
+        assert!(noise.is_finite() && (border.area() - 168.0).abs() < 60.0, "{noise_level}: {}", border.area());
     }
 }
 
