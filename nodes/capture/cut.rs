@@ -99,7 +99,7 @@ fn why_empty(segmentation: &Segmentation) -> String {
     }
 }
 
-/// What is wrong with a segmentation, in words: pieces left out, pieces that had to be cut apart, and pieces beside shadows.
+/// What is wrong with a segmentation, in words: pieces left out, pieces that had to be cut apart, pieces beside shadows, and borders that are not told all the way.
 pub fn left_out(segmentation: &Segmentation) -> Vec<String> {
     let shape = |aoi: &Aoi| format!("the shape of {} x {} px at ({}, {})", aoi.width, aoi.height, aoi.x, aoi.y);
     let rejected = segmentation.rejected.iter().filter_map(|rejected| {
@@ -119,7 +119,15 @@ pub fn left_out(segmentation: &Segmentation) -> Vec<String> {
     let shaded = (shaded > 0).then(|| {
         format!("{shaded} shape(s) cast a shadow; where it lies beside them their borders are told less exactly")
     });
-    rejected.chain(separated).chain(shaded).collect()
+    let untold = segmentation.untold.first().map(|first| {
+        format!(
+            "{} shape(s) have a border that can't be told all the way (the first: {}): print of the ground's level, gloss, dirt or a shadow \
+             lies there",
+            segmentation.untold.len(),
+            shape(first)
+        )
+    });
+    rejected.chain(separated).chain(shaded).chain(untold).collect()
 }
 
 #[cfg(test)]
@@ -136,6 +144,18 @@ mod tests {
         let colour = image::ImageBuffer::from_raw(2, 1, vec![0_u16, 1000, 2000, 4000, 0, 1000]);
         let Pixels::Rgb(colour) = Pixels::from(colour.map(DynamicImage::ImageRgb16).unwrap()) else { panic!("rgb") };
         assert_eq!(colour.as_raw(), &[0, 63, 127, 255, 0, 63]);
+    }
+
+    #[test]
+    fn borders_that_are_not_told_are_named() {
+        let aoi = Aoi { x: 5, y: 7, width: 120, height: 130 };
+        let words = left_out(&Segmentation { untold: vec![aoi, aoi], ..Segmentation::default() });
+        assert_eq!(words.len(), 1);
+        assert!(
+            words[0].starts_with("2 shape(s) have a border") && words[0].contains("120 x 130 px at (5, 7)"),
+            "{words:?}"
+        );
+        assert!(left_out(&Segmentation::default()).is_empty());
     }
 
     #[test]

@@ -14,6 +14,7 @@
 //!    divided by the local contrast. Pixels beyond half-way are joined to components once more: neighbours whose shadows
 //!    or glow met come apart. Where a part of the border is soft, it is sought within the shadow that makes it so ([`Segmentation::shaded`]). Print that comes
 //!    near the ground's level belongs to the shape where its edge to the ground is crisp. Threads that hang on a shape (hairs) are taken off.
+//!    A border beside which, or across which, levels are not as elsewhere is named ([`Segmentation::untold`]).
 //! 5. *Rejection*, each with its [`Reason`]: cut by the frame's edge, too small beside the others, thread-like (hairs,
 //!    scanner edges), soft beside sharp ones or faint without a crisp edge (glare), convex beside such with bays (coins, labels, rulers), two shapes that touch (of about twice the usual area, with an isthmus between the halves; it is a waist where most large shapes have none). Where that
 //!    isthmus is too narrow to be the neck of one of them they are cut apart instead ([`Segmentation::separated`]).
@@ -36,6 +37,7 @@
 //! # Ok::<(), isthmus::mask::MaskError>(())
 //! ```
 
+mod across;
 mod blocks;
 mod clipping;
 mod convex;
@@ -63,7 +65,7 @@ use crop::Crop;
 use ground::Ground;
 use print::Print;
 use runs::Components;
-use shadows::Shadows;
+use shadows::{Beside, Shadows};
 use sift::{Found, sift};
 use standing::Standing;
 use threads::Threads;
@@ -165,15 +167,16 @@ impl Segmenter {
             }
             self.crop.take(frame, &standing, k);
             self.crop.label(&mut self.fine);
-            let shaded = self.crop.lift_shadows(&self.fine, &mut self.shadows, parameters);
+            let mut beside = self.crop.lift_shadows(&self.fine, &mut self.shadows, parameters);
             let recovered = self.crop.is_print && self.crop.recover_print(frame, &standing, k, &mut self.print);
-            if shaded || recovered {
+            beside.is_doubtful |= recovered;
+            if beside.is_shaded || recovered {
                 self.crop.label(&mut self.fine);
             }
             if self.crop.erase_threads(&self.fine, &mut self.threads, parameters) {
                 self.crop.label(&mut self.fine);
             }
-            self.collect(frame, parameters, shaded, &mut found, &mut rejected);
+            self.collect(frame, parameters, beside, &mut found, &mut rejected);
         }
         standing::release(blocks, &self.coarse, &mut self.owner);
         sift(frame, parameters, found, rejected)
@@ -184,7 +187,7 @@ impl Segmenter {
         &self,
         frame: &Frame<'_>,
         parameters: &Parameters,
-        shaded: bool,
+        beside: Beside,
         found: &mut Vec<Found>,
         rejected: &mut Vec<Rejected>,
     ) {
@@ -208,7 +211,7 @@ impl Segmenter {
             let contact = self.rim_contact(frame, index);
             let cutout = crop.cutout(&self.fine, index);
             let is_convex = convex::may_be_convex(c, self.fine.runs_of(index)) && convex::is_convex(&cutout);
-            found.push(Found { cutout, area: c.area, contact, contrast: crop.contrast, shaded, is_convex });
+            found.push(Found { cutout, area: c.area, contact, contrast: crop.contrast, beside, is_convex });
         }
     }
 

@@ -378,7 +378,44 @@ fn what_is_soft_all_round_is_no_shadow() {
         let (pixels, necks) = scene(Camera { blur, vignette, noise, ..Camera::default() });
         let found = grey(&pixels);
         check(&found, &necks, &format!("blur {blur}"));
-        assert_eq!(found.shaded, [], "blur {blur}, vignette {vignette}, noise {noise}");
+        assert_eq!((found.shaded, found.untold), (vec![], vec![]), "blur {blur}, vignette {vignette}, noise {noise}");
+    }
+}
+
+/// A border that another line may be taken for is named, and no other.
+#[test]
+fn borders_that_are_not_told_all_the_way_are_named() {
+    const SHAPE: f64 = 40.0;
+    const GROUND: f64 = 215.0;
+    let (clean, necks) =
+        scene(Camera { shape_level: SHAPE, ground_level: GROUND, noise: 3.0, blur: 1.0, ..Camera::default() });
+    let found = grey(&clean);
+    check(&found, &necks, "clean");
+    assert_eq!(found.untold, []);
+    let (border, _) = Border::from_cutout(&found.cutouts[1]).unwrap();
+    let middle = border.centroid();
+    let is_shape = |p: u8| f64::from(p) < (SHAPE + GROUND) / 2.0;
+    let faded = |p: u8, part: f64| {
+        if is_shape(p) { (GROUND + (SHAPE - GROUND) * part + f64::from(p) - SHAPE) as u8 } else { p }
+    };
+    for (k, &edge) in border.points.iter().enumerate().step_by(border.points.len() / 7) {
+        let spoils = [("print of 15 % of the contrast", edge, 24.0), ("gloss", edge, 80.0), ("a hole", middle, 14.0)];
+        for (what, place, radius) in spoils {
+            let mut pixels = clean.clone();
+            let part = |distance: f64| match what {
+                "gloss" => distance,
+                "a hole" => 0.0,
+                _ => 0.15,
+            };
+            disc(&mut pixels, (place.x, place.y), radius, |p, distance| faded(p, part(distance)));
+            let found = grey(&pixels);
+            assert_eq!(found.untold.len(), 1, "{what} at point {k}: {:?}", found.untold);
+            let aoi = found.untold[0];
+            assert!(
+                (aoi.x - found.cutouts[1].aoi.x).abs() < 2 && found.cutouts.len() == CENTRES.len(),
+                "{what}: {aoi:?}"
+            );
+        }
     }
 }
 

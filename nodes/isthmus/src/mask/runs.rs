@@ -3,6 +3,9 @@
 
 use crate::changes::changes;
 
+/// Widest gap at which a hole that ends is no more than a speck, in pixels.
+const SPECK: usize = 2;
+
 /// Neighbouring pixels of one row.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Run {
@@ -24,6 +27,8 @@ pub(super) struct Component {
     pub(super) right: usize,
     /// One past the lowest row.
     pub(super) bottom: usize,
+    /// Whether it has a hole that is wider than specks are.
+    pub(super) is_hollow: bool,
 }
 
 /// Runs and components, filled row by row.
@@ -32,6 +37,8 @@ pub(super) struct Components {
     pub(super) runs: Vec<Run>,
     pub(super) list: Vec<Component>,
     parent: Vec<usize>,
+    /// Runs that close a hole above them.
+    closing: Vec<usize>,
     previous: std::ops::Range<usize>,
     current: usize,
     row: usize,
@@ -42,6 +49,7 @@ impl Components {
         self.runs.clear();
         self.list.clear();
         self.parent.clear();
+        self.closing.clear();
         self.previous = 0..0;
         self.current = 0;
         self.row = 0;
@@ -89,6 +97,10 @@ impl Components {
                 break;
             }
             let (a, b) = (self.root(self.runs[k].label), self.root(label));
+            // Both sides of the gap before it belong to one component already.
+            if a == b && self.runs[k].start - self.runs[k - 1].end > SPECK {
+                self.closing.push(label);
+            }
             self.parent[a.max(b)] = a.min(b);
         }
         self.runs.push(Run { row: self.row, start, end, label });
@@ -117,6 +129,7 @@ impl Components {
                     top: run.row,
                     right: run.end,
                     bottom: run.row + 1,
+                    is_hollow: false,
                 });
             }
             let c = &mut self.list[run.label];
@@ -124,6 +137,9 @@ impl Components {
             c.left = c.left.min(run.start);
             c.right = c.right.max(run.end);
             c.bottom = run.row + 1;
+        }
+        for run in &self.closing {
+            self.list[self.runs[*run].label].is_hollow = true;
         }
     }
 }

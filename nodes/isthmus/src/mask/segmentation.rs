@@ -67,6 +67,9 @@ pub struct Segmentation {
     pub separated: Vec<Aoi>,
     /// Bounding boxes of shapes beside which a shadow was told from them, in the same order; their border there is that of shape and shadow.
     pub shaded: Vec<Aoi>,
+    /// Bounding boxes of shapes whose border is not told all the way, in the same order: what lies beside it, or the step across it, is not as elsewhere (print of the ground's level, gloss, dirt,
+    /// a shadow), or they have holes. Another line may be taken for their border there.
+    pub untold: Vec<Aoi>,
 }
 
 /// Specks smaller than this, in pixels, are not reported: noise and dust make any number of them.

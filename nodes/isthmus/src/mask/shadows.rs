@@ -3,7 +3,7 @@
 //! # Method
 //! The border of a shape is as sharp all round as the picture shows edges. Where a shadow lies beside the shape its outer edge is taken for the border instead, and that is
 //! soft, or the border is right but the ground beside it is not as elsewhere, and half-way lies elsewhere.
-//! 1. *Suspicion*: at some rows' ends the levels on either side of the border are compared. Only where a part of it is far softer than most, or has other ground beside it, the
+//! 1. *Suspicion*: at some rows' ends the levels on either side of the border are compared (also to tell whether a border is worth the look of `across`). Only where a part of it is far softer than most, or has other ground beside it, the
 //!    rest is done.
 //! 2. *Watershed* (L. Vincent, P. Soille, *Watersheds in digital spaces*, IEEE Trans. PAMI 13, 1991): the crop is flooded from its rim and from the depths of
 //!    its shapes, over the steepness of the levels beyond that of their surroundings, which slow changes hardly have. The floods meet along the sharpest line between the two.
@@ -27,6 +27,10 @@ const ROWS: usize = 32;
 const SOFT: f32 = 0.7;
 /// Difference of the ground beside a border from that elsewhere that shows shadow, as a part of the contrast: the ground itself varies by less than half of it.
 const SHADE: f32 = 0.15;
+/// An edge by which a border is looked at more closely, likewise, and how many of them: some more than what print, grain and noise of pieces that are told all the way do to most.
+const SOFTER: f32 = 0.8;
+const SHADIER: f32 = 0.1;
+const LEAST_UNLIKE: usize = 2;
 /// Least part of a border that lies in shadow. A lamp leaves a third to a half of it there; of scanned print up to a tenth is soft.
 const LEAST_SHARE: f64 = 0.15;
 /// Most noise at which shadows are told, as a part of the contrast: as for threads, pixels on the wrong side are no chance.
@@ -69,10 +73,21 @@ struct Edge {
     shade: f32,
 }
 
+/// What is found beside the shapes of a crop.
+#[derive(Debug, Clone, Copy, Default)]
+pub(super) struct Beside {
+    /// Whether there was a shadow, told from its shape.
+    pub(super) is_shaded: bool,
+    /// Whether a border may not be told all the way.
+    pub(super) is_doubtful: bool,
+}
+
 /// Finds shadows, keeping its buffers from one component to the next.
 #[derive(Debug, Clone, Default)]
 pub(super) struct Shadows {
+    /// At the outer ends of rows, and at the other ends.
     edges: Vec<Edge>,
+    inner: Vec<Edge>,
     /// Levels in parts of the contrast: 0 for ground, 1 for shape.
     levels: Vec<f32>,
     steepness: Vec<u8>,
@@ -85,43 +100,50 @@ pub(super) struct Shadows {
 }
 
 impl Crop {
-    /// Makes ground of the shadows beside the shapes found; whether there are any. To be labelled again then.
+    /// Makes ground of the shadows beside the shapes found. To be labelled again where there are any.
     pub(super) fn lift_shadows(
         &mut self,
         components: &Components,
         shadows: &mut Shadows,
         parameters: &Parameters,
-    ) -> bool {
+    ) -> Beside {
         if self.noise_level > MAX_NOISE * (self.shape_level - self.ground_level).abs() {
-            return false;
+            return Beside { is_shaded: false, is_doubtful: true };
         }
         let labels = || (0..components.list.len()).filter(|label| components.list[*label].area >= parameters.min_area);
-        shadows.edges.clear();
-        for label in labels() {
-            self.look_along(components, label, &mut shadows.edges);
-        }
-        shadows.are_suspected() && shadows.find(self, components, parameters.min_area) && shadows.lift(self)
+        let Shadows { edges, inner, .. } = shadows;
+        edges.clear();
+        inner.clear();
+        labels().for_each(|label| self.look_along(components, label, [&mut *edges, &mut *inner]));
+        let (are_suspected, are_unlike) = shadows.are_unlike();
+        let is_doubtful = are_unlike || labels().any(|label| components.list[label].is_hollow);
+        let is_shaded = are_suspected && shadows.find(self, components, parameters.min_area) && shadows.lift(self);
+        Beside { is_shaded, is_doubtful: is_shaded || is_doubtful }
     }
 
-    /// Looks at the border of a component, at the outer ends of some of its rows.
-    fn look_along(&self, components: &Components, label: usize, edges: &mut Vec<Edge>) {
-        let (width, height) = (self.width as i32, (self.pixels.len() / self.width.max(1)) as i32);
+    /// Looks at the border of a component, at the outer ends of some of its rows and at the other ends of runs there.
+    fn look_along(&self, components: &Components, label: usize, [outer, inner]: [&mut Vec<Edge>; 2]) {
+        let width = self.width as isize;
         let scale = 1.0 / (self.shape_level - self.ground_level);
-        let level = |x: i32, y: i32| {
-            let is_within = x >= 0 && y >= 0 && x < width && y < height;
-            if is_within { (f32::from(self.pixels[(y * width + x) as usize]) - self.ground_level) * scale } else { 0.0 }
+        // The crop's margin is wider than what is looked at.
+        let level = |at: isize| {
+            self.pixels.get(at as usize).map_or(0.0, |pixel| (f32::from(*pixel) - self.ground_level) * scale)
         };
-        let edge = |x: usize, y: usize, outwards: i32| {
-            let profile = |(dx, dy): (i32, i32)| {
-                // Two places on either side, and one beyond the blur of the edge; diagonal steps are longer.
-                let [near, far, beyond] = if dx != 0 && dy != 0 { [1, 3, 5] } else { [2, 4, 7] };
-                let at = |steps: i32| level(x as i32 + steps * dx, y as i32 + steps * dy);
-                Edge { step: (at(-near) + at(-far) - at(near) - at(far)) / 2.0, shade: at(beyond).abs() }
-            };
-            let directions = [(outwards, 0), (outwards, 1), (outwards, -1), (0, 1), (0, -1)];
-            directions.map(profile).into_iter().fold(Edge { step: f32::MIN, shade: f32::MAX }, |a, b| Edge {
-                step: a.step.max(b.step),
-                shade: a.shade.min(b.shade),
+        let edge = |row: usize, column: usize, outwards: isize| {
+            let place = row as isize * width + column as isize;
+            // Two places on either side, and one beyond the blur of the edge; diagonal steps are longer.
+            let (straight, diagonal) = ([2, 4, 7], [1, 3, 5]);
+            let directions = [
+                (outwards, straight),
+                (width, straight),
+                (-width, straight),
+                (outwards + width, diagonal),
+                (outwards - width, diagonal),
+            ];
+            directions.iter().fold(Edge { step: f32::MIN, shade: f32::MAX }, |edge, (way, [near, far, beyond])| {
+                let at = |steps: isize| level(place + steps * way);
+                let step = (at(-near) + at(-far) - at(*near) - at(*far)) / 2.0;
+                Edge { step: edge.step.max(step), shade: edge.shade.min(at(*beyond).abs()) }
             })
         };
         let c = components.list[label];
@@ -129,25 +151,26 @@ impl Crop {
         let mut runs = components.runs_of(label).filter(|run| run.row.is_multiple_of(step)).peekable();
         let mut row = None;
         while let Some(run) = runs.next() {
-            if row.replace(run.row) != Some(run.row) {
-                edges.push(edge(run.start, run.row, -1));
-            }
-            if runs.peek().is_none_or(|next| next.row != run.row) {
-                edges.push(edge(run.end - 1, run.row, 1));
-            }
+            let is_first = row.replace(run.row) != Some(run.row);
+            let is_last = runs.peek().is_none_or(|next| next.row != run.row);
+            (if is_first { &mut *outer } else { &mut *inner }).push(edge(run.row, run.start, -1));
+            (if is_last { &mut *outer } else { &mut *inner }).push(edge(run.row, run.end - 1, 1));
         }
     }
 }
 
 impl Shadows {
-    /// Whether a part of the border looked at is softer than the rest, or has other ground beside it.
-    fn are_suspected(&mut self) -> bool {
-        let edges = &mut self.edges;
-        let Some(last) = edges.len().checked_sub(1) else { return false };
+    /// Whether so much of the border looked at is softer than the rest, or has other ground beside it, that it lies in shadow; whether some of it is.
+    fn are_unlike(&mut self) -> (bool, bool) {
+        let Self { edges, inner, .. } = self;
+        let Some(last) = edges.len().checked_sub(1) else { return (false, false) };
         let usual = edges.select_nth_unstable_by(last * 3 / 4, |a, b| a.step.total_cmp(&b.step)).1.step;
         let clear = edges.select_nth_unstable_by(last / 4, |a, b| a.shade.total_cmp(&b.shade)).1.shade;
-        let is_in_shade = |edge: &&Edge| edge.step < SOFT * usual || edge.shade > clear + SHADE;
-        edges.iter().filter(is_in_shade).count() as f64 >= LEAST_SHARE * edges.len() as f64
+        let count = |edges: &[Edge], soft: f32, shade: f32| {
+            edges.iter().filter(|edge| edge.step < soft * usual || edge.shade > clear + shade).count()
+        };
+        let unlike = count(edges, SOFTER, SHADIER) + count(inner, SOFTER, SHADIER);
+        (count(edges, SOFT, SHADE) as f64 >= LEAST_SHARE * edges.len() as f64, unlike >= LEAST_UNLIKE)
     }
 
     /// Finds the line between ground and shapes, and what lies on either side; whether it is one.

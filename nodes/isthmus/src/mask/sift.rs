@@ -1,9 +1,11 @@
 //! Which of the shapes found are shapes of their own, beside the others.
 
+use super::across::{has_crisp_edge, is_untold};
 use super::crop::Crop;
 use super::frame::Frame;
 use super::runs::Components;
 use super::segmentation::{Parameters, Reason, Rejected, Segmentation};
+use super::shadows::Beside;
 use super::statistics::{median, quantile};
 use crate::Point;
 use crate::contour::Border;
@@ -38,15 +40,6 @@ const STRIP_LENGTH: f64 = 2.5;
 /// ... and thinner on the mean than this part of the same: the edge of a sheet or of the scanner's glass, of which pieces show more.
 const STRIP_WIDTH: f64 = 0.1;
 
-/// How far on either side of a border levels are compared to tell a crisp edge, as a part of the square root of the shape's area: light that falls off
-/// from a spot's middle to its rim does so little there.
-const EDGE_REACH: f64 = 0.05;
-/// ... at least and at most, in pixels: beyond the blur of usual pictures, and within the margin of a cutout.
-const MIN_EDGE_REACH: f64 = 2.0;
-const MAX_EDGE_REACH: f64 = 6.0;
-/// Least part of a shape's contrast that a crisp edge has within that reach: a spot of light has a sixth, an edge in focus all.
-const CRISP_EDGE: f64 = 0.6;
-
 /// Rows of a shape at whose ends its sharpness is looked at, about.
 const ROWS: usize = 16;
 /// How far on either side of its ends levels are compared there, in pixels: beyond the blur of pictures in focus, and within the margin of a cutout.
@@ -60,8 +53,7 @@ pub(super) struct Found {
     pub(super) area: usize,
     pub(super) contact: usize,
     pub(super) contrast: f32,
-    /// Whether a shadow beside it was told from it.
-    pub(super) shaded: bool,
+    pub(super) beside: Beside,
     /// Whether it has no bays.
     pub(super) is_convex: bool,
 }
@@ -133,10 +125,9 @@ pub(super) fn sift(
     let large = found.iter().filter(|f| f.contact == 0 && !f.is_convex && is_large(f));
     let whole = large.map(|f| contact(&f.cutout, median_area as f64).is_none()).collect::<Vec<_>>();
     let are_alike = 2 * whole.iter().filter(|is_whole| **is_whole).count() <= whole.len();
-    let mut cutouts = Vec::new();
+    let mut taken: Vec<Found> = Vec::new();
     let mut convex = Vec::new();
     let mut separated = Vec::new();
-    let mut shaded = Vec::new();
     let mut open = found;
     while let Some(f) = open.pop() {
         let aoi = f.cutout.aoi;
@@ -165,26 +156,26 @@ pub(super) fn sift(
         match reason {
             Some(reason) => rejected.push(Rejected { aoi, area: f.area, reason }),
             None if f.is_convex => convex.push(f),
-            None => {
-                shaded.extend(f.shaded.then_some(aoi));
-                cutouts.push(f.cutout);
-            }
+            None => taken.push(f),
         }
     }
-    let has_bays = !cutouts.is_empty();
+    let has_bays = !taken.is_empty();
     for f in convex {
         if has_bays {
             rejected.push(Rejected { aoi: f.cutout.aoi, area: f.area, reason: Reason::Convex });
         } else {
-            shaded.extend(f.shaded.then_some(f.cutout.aoi));
-            cutouts.push(f.cutout);
+            taken.push(f);
         }
     }
     separated.sort_by_key(|aoi| (aoi.y, aoi.x));
-    shaded.sort_by_key(|aoi| (aoi.y, aoi.x));
-    cutouts.sort_by_key(|c| (c.aoi.y, c.aoi.x));
     rejected.sort_by_key(|r| (r.aoi.y, r.aoi.x));
-    (Segmentation { cutouts, rejected, separated, shaded }, has_bays)
+    taken.sort_by_key(|f| (f.cutout.aoi.y, f.cutout.aoi.x));
+    let boxes = |is_meant: &dyn Fn(&Found) -> bool| {
+        taken.iter().filter(|f| is_meant(f)).map(|f| f.cutout.aoi).collect::<Vec<_>>()
+    };
+    let [shaded, untold] = [boxes(&|f| f.beside.is_shaded), boxes(&|f| f.beside.is_doubtful && is_untold(&f.cutout))];
+    let cutouts = taken.into_iter().map(|f| f.cutout).collect();
+    (Segmentation { cutouts, rejected, separated, shaded, untold }, has_bays)
 }
 
 /// The step of the level at the ends of some of a shape's rows, as a part of the contrast: the upper quartile.
@@ -205,28 +196,6 @@ fn sharpness(cutout: &Cutout) -> f32 {
         ends.into_iter().flatten().map(move |x| (x, y))
     });
     quantile(&steps.map(|(x, y)| step(x, y)).collect::<Vec<_>>(), 0.75)
-}
-
-/// Whether the level falls off at the border of a shape rather than all over it: the edge of a piece, however faint, does, those of glare and
-/// shadows don't.
-fn has_crisp_edge(cutout: &Cutout) -> bool {
-    let Ok((border, _)) = Border::from_cutout(cutout) else { return false };
-    let reach = (EDGE_REACH * border.area().sqrt()).clamp(MIN_EDGE_REACH, MAX_EDGE_REACH);
-    let (width, height) = (cutout.window.width as i32, cutout.window.height as i32);
-    let level = |p: Point| {
-        let (x, y) = (p.x.round() as i32 - cutout.window.x, p.y.round() as i32 - cutout.window.y);
-        f64::from(cutout.pixels[(y.clamp(0, height - 1) * width + x.clamp(0, width - 1)) as usize])
-    };
-    let points = &border.points;
-    let n = points.len();
-    let step = |k: usize| {
-        let along = (points[(k + 1) % n] - points[(k + n - 1) % n]).normalize();
-        // Clockwise on a screen, y down: the shape is on the right.
-        let inwards = reach * nalgebra::Vector2::new(-along.y, along.x);
-        level(points[k] + inwards) - level(points[k] - inwards)
-    };
-    let mean = (0..n).map(step).sum::<f64>() / n as f64;
-    mean / f64::from(cutout.shape_level - cutout.ground_level) >= CRISP_EDGE
 }
 
 /// The narrowest place at which two shapes of about a given area each touch: an isthmus with most of a shape on either side.
@@ -274,7 +243,7 @@ fn part(found: &Found, contact: [Point; 2], area: f64) -> Vec<Found> {
         area: components.list[index].area,
         contact: 0,
         contrast: found.contrast,
-        shaded: found.shaded,
+        beside: found.beside,
         is_convex: false,
     };
     parts.into_iter().map(part).collect()
