@@ -5,6 +5,7 @@
 
 use crate::Piece;
 use isthmus::isthmus::{Isthmus, Polarity};
+use isthmus::wide::widely;
 use isthmus::{Point, hull};
 use nalgebra::Vector2;
 use std::sync::{LazyLock, OnceLock};
@@ -487,8 +488,94 @@ pub(crate) fn convex_hull(mut points: Vec<Point>) -> Vec<Point> {
     hull::convex_hull(&points).into_iter().map(|k| points[k]).collect()
 }
 
+/// Cells worked on side by side, so that the arithmetic fills the registers of AVX2.
+const LANES: usize = 8;
+
+/// What the cells of a raster know of the border: the point next to each, where that lies from the corner of the raster, and the square of
+/// its distance. A rim of cells that know of none spares a look at where the raster ends.
+struct Seen {
+    /// Whole groups of cells.
+    columns: usize,
+    rows: usize,
+    point: Vec<u32>,
+    x: Vec<f32>,
+    y: Vec<f32>,
+    square: Vec<f32>,
+}
+
+impl Seen {
+    fn new(columns: usize, rows: usize) -> Self {
+        let [columns, rows] = [columns, rows].map(|n| n.next_multiple_of(LANES));
+        let nowhere = vec![f32::INFINITY; (columns + 2) * (rows + 2)];
+        let point = vec![0; nowhere.len()];
+        Self { columns, rows, point, x: nowhere.clone(), y: nowhere.clone(), square: nowhere }
+    }
+
+    fn place(&self, column: usize, row: usize) -> usize {
+        (row + 1) * (self.columns + 2) + column + 1
+    }
+
+    /// Columns for rows.
+    fn transposed(&self) -> Self {
+        let mut other = Self::new(self.rows, self.columns);
+        for r in 0..self.rows {
+            for c in 0..self.columns {
+                let (from, to) = (self.place(c, r), other.place(r, c));
+                (other.point[to], other.square[to]) = (self.point[from], self.square[from]);
+                (other.x[to], other.y[to]) = (self.y[from], self.x[from]);
+            }
+        }
+        other
+    }
+
+    /// Each row learns from the one before it, then from the one behind it: what lies rather that way than along the row.
+    #[inline(always)]
+    fn sweep(&mut self, cell: f32) {
+        let width = self.columns + 2;
+        let centres: Vec<f32> = (0..self.columns as u32).map(|c| (c as f32 + 0.5) * cell).collect();
+        for (row, beside) in (0..self.rows).map(|r| (r, r)).chain((0..self.rows).rev().map(|r| (r, r + 2))) {
+            self.learn((row + 1) * width + 1, beside * width + 1, &centres, (row as f32 + 0.5) * cell);
+        }
+    }
+
+    /// The cells of a row look at the three next to them in another one.
+    #[inline(always)]
+    fn learn(&mut self, row: usize, beside: usize, xs: &[f32], y: f32) {
+        for c in (0..self.columns).step_by(LANES) {
+            let x = lanes(xs, c);
+            let here = row + c;
+            let (mut u, mut v) = (lanes(&self.x, here), lanes(&self.y, here));
+            let (mut square, mut point) = (lanes(&self.square, here), lanes(&self.point, here));
+            for there in [beside + c, beside + c - 1, beside + c + 1] {
+                let (us, vs, points) = (lanes(&self.x, there), lanes(&self.y, there), lanes(&self.point, there));
+                let mut other = [0f32; LANES];
+                for l in 0..LANES {
+                    other[l] = (x[l] - us[l]).powi(2) + (y - vs[l]).powi(2);
+                }
+                // One number after the other, for otherwise the compiler doesn't see that they lie side by side.
+                (0..LANES).for_each(|l| u[l] = if other[l] < square[l] { us[l] } else { u[l] });
+                (0..LANES).for_each(|l| v[l] = if other[l] < square[l] { vs[l] } else { v[l] });
+                (0..LANES).for_each(|l| point[l] = if other[l] < square[l] { points[l] } else { point[l] });
+                (0..LANES).for_each(|l| square[l] = if other[l] < square[l] { other[l] } else { square[l] });
+            }
+            self.x[here..here + LANES].copy_from_slice(&u);
+            self.y[here..here + LANES].copy_from_slice(&v);
+            self.square[here..here + LANES].copy_from_slice(&square);
+            self.point[here..here + LANES].copy_from_slice(&point);
+        }
+    }
+}
+
+/// Some numbers from a place on.
+#[inline(always)]
+fn lanes<T: Copy + Default>(from: &[T], place: usize) -> [T; LANES] {
+    let mut lanes = [T::default(); LANES];
+    lanes.copy_from_slice(&from[place..place + LANES]);
+    lanes
+}
+
 impl Raster {
-    /// Two sweeps of nearest-point propagation (Danielsson), exact enough at this coarseness.
+    /// Nearest-point propagation (Danielsson), exact enough at this coarseness.
     fn new(points: &[Point], cell: f64) -> Self {
         let cell = cell.max(1e-6);
         let (mut low, mut high) = (points[0], points[0]);
@@ -506,53 +593,19 @@ impl Raster {
             |c: usize, r: usize| Point::new(origin.x + (c as f64 + 0.5) * cell, origin.y + (r as f64 + 0.5) * cell);
         let xs: Vec<f64> = (0..columns).map(|c| centre(c, 0).x).collect();
         let ys: Vec<f64> = (0..rows).map(|r| centre(0, r).y).collect();
-        // A rim of cells that know no border point spares the sweeps a look at where the raster ends.
-        let width = columns + 2;
-        let place = |c: usize, r: usize| (r + 1) * width + c + 1;
-        let mut nearest = vec![u32::MAX; width * (rows + 2)];
-        let mut square = vec![f64::INFINITY; nearest.len()];
+        let mut seen = Seen::new(columns, rows);
         for (i, p) in points.iter().enumerate() {
             let (c, r) = (((p.x - origin.x) / cell) as usize, ((p.y - origin.y) / cell) as usize);
-            let k = place(c.min(columns - 1), r.min(rows - 1));
-            let d = (centre(c, r) - p).norm_squared();
-            if d < square[k] {
-                (square[k], nearest[k]) = (d, i as u32);
+            let k = seen.place(c.min(columns - 1), r.min(rows - 1));
+            let square = (centre(c, r) - p).norm_squared() as f32;
+            if square < seen.square[k] {
+                (seen.square[k], seen.point[k]) = (square, i as u32);
+                (seen.x[k], seen.y[k]) = ((p.x - origin.x) as f32, (p.y - origin.y) as f32);
             }
         }
-        // The border point next to a cell and its distance, given those that cells beside it know.
-        let relax = |p: Point, known: (u32, f64), beside: &[u32]| {
-            beside.iter().fold(known, |(near, least), other| {
-                let Some(point) = points.get(*other as usize).filter(|_| *other != near) else { return (near, least) };
-                let d = (p - point).norm_squared();
-                if d < least { (*other, d) } else { (near, least) }
-            })
-        };
-        for downwards in [true, false] {
-            for step in 0..rows {
-                let r = if downwards { step } else { rows - 1 - step };
-                let (above, rest) = nearest.split_at_mut((r + 1) * width);
-                let (here, below) = rest.split_at_mut(width);
-                let (above, below) = (&above[r * width..], &below[..width]);
-                let here_square = &mut square[(r + 1) * width..(r + 2) * width];
-                let mut see = |c: usize, beside: &[u32], here: &mut [u32]| {
-                    let known = (here[c + 1], here_square[c + 1]);
-                    (here[c + 1], here_square[c + 1]) = relax(Point::new(xs[c], ys[r]), known, beside);
-                };
-                if downwards {
-                    for c in 0..columns {
-                        see(c, &[here[c], above[c + 1], above[c], above[c + 2]], here);
-                    }
-                    (0..columns).rev().for_each(|c| see(c, &[here[c + 2]], here));
-                } else {
-                    for c in (0..columns).rev() {
-                        see(c, &[here[c + 2], below[c + 1], below[c + 2], below[c]], here);
-                    }
-                    (0..columns).for_each(|c| see(c, &[here[c]], here));
-                }
-            }
-        }
-        let nearest: Vec<u32> =
-            nearest.chunks(width).skip(1).take(rows).flat_map(|row| &row[1..=columns]).copied().collect();
+        widely!(seen.sweep(cell as f32));
+        let mut seen = seen.transposed();
+        widely!(seen.sweep(cell as f32));
         // Which side a cell lies on is counted, not told from the nearest normal: beyond a corner that is ambiguous.
         let mut crossings: Vec<Vec<f64>> = vec![Vec::new(); rows];
         // The first row whose centres lie at this height or below.
@@ -570,16 +623,18 @@ impl Raster {
             from = to;
         }
         let mut distance = vec![0f32; columns * rows];
+        let mut nearest = vec![0; columns * rows];
         for (r, list) in crossings.iter_mut().enumerate() {
             list.sort_by(f64::total_cmp);
             let mut passed = 0;
             for (c, x) in xs.iter().enumerate() {
                 let k = r * columns + c;
-                let p = Point::new(*x, ys[r]);
-                while list.get(passed).is_some_and(|x| *x < p.x) {
+                while list.get(passed).is_some_and(|crossing| crossing < x) {
                     passed += 1;
                 }
-                let d = (p - points[nearest[k] as usize]).norm() as f32;
+                let from = seen.place(r, c);
+                nearest[k] = seen.point[from];
+                let d = seen.square[from].sqrt();
                 distance[k] = if passed % 2 == 1 { -d } else { d };
             }
         }
