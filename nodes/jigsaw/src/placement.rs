@@ -324,41 +324,48 @@ impl Feet {
         [residual / count.max(1.0), overlap, gap]
     }
 
-    /// Median residual, bit by bit: the greatest number than which no more than half of them are less. Numbers that aren't
-    /// negative are ordered as their bits are.
+    /// Width of the robust weights: thrice the median residual, but not less than suits the limit of the clearance. The median is
+    /// found bit by bit: the greatest number than which no more than half of them are less. Numbers that aren't negative are ordered
+    /// as their bits are.
     #[inline(always)]
-    fn spread(&mut self, clearance: f64) -> f64 {
+    fn weight_width(&mut self, clearance: f64, limit: f64) -> f64 {
+        /// Bits of the median that are left at nothing: it is known to 3 %.
+        const ROUGH: u32 = 18;
+        let least = LEAST_WIDTH / MAX_CLEARANCE * limit;
         let clearance = clearance as f32;
-        let middle = (self.rows() / 2) as i32;
         self.off.clear();
+        let mut present = [0f32; LANES];
         for group in &self.groups {
             let mut off = [i32::MAX; LANES];
             for l in 0..LANES {
+                present[l] += group.mask[l];
                 if group.mask[l] > 0.0 {
                     off[l] = (group.distance[l] - clearance).abs().to_bits() as i32;
                 }
             }
             self.off.push(off);
         }
-        let mut median = 0;
-        for bit in (0..31).rev() {
-            let larger = median | 1 << bit;
+        let middle = (present.iter().sum::<f32>() as usize / 2) as i32;
+        let reaches = |bound: i32| {
             let mut less = [0; LANES];
             for off in &self.off {
                 for l in 0..LANES {
-                    less[l] += i32::from(off[l] < larger);
+                    less[l] += i32::from(off[l] < bound);
                 }
             }
-            if less.iter().sum::<i32>() <= middle {
-                median = larger;
-            }
+            less.iter().sum::<i32>() <= middle
+        };
+        // Most of what fits needs no more than this look.
+        if !reaches(((least / 3.0) as f32).to_bits() as i32) {
+            return least;
         }
-        f64::from(f32::from_bits(median as u32))
+        let median = (ROUGH..31).rev().fold(0, |m, bit| if reaches(m | 1 << bit) { m | 1 << bit } else { m });
+        least.max(3.0 * f64::from(f32::from_bits(median as u32)))
     }
 
     /// What the contact tells about the pose: the normal matrix without the clearance (Schur complement).
     fn information(&mut self, clearance: f64, limit: f64, free: bool) -> Matrix3<f64> {
-        let width = weight_width(widely!(self.spread(clearance)), limit);
+        let width = widely!(self.weight_width(clearance, limit));
         let (h, ..) = widely!(self.normal_equations(clearance, width));
         let block = h.fixed_view::<3, 3>(0, 0).into_owned();
         let column: Vector3<f64> = h.fixed_view::<3, 1>(0, 3).into_owned();
@@ -410,14 +417,9 @@ impl Feet {
     }
 }
 
-/// Width of the robust weights, given the typical residual and the limit of the clearance.
-fn weight_width(spread: f64, limit: f64) -> f64 {
-    (3.0 * spread).max(LEAST_WIDTH / MAX_CLEARANCE * limit)
-}
-
 /// One step of weighted least squares.
 fn step(feet: &mut Feet, pose: &mut Pose, clearance: &mut f64, free: bool, limit: f64) {
-    let width = weight_width(widely!(feet.spread(*clearance)), limit);
+    let width = widely!(feet.weight_width(*clearance, limit));
     let (mut h, mut g, total) = widely!(feet.normal_equations(*clearance, width));
     if total < 4.0 {
         return;
