@@ -332,7 +332,7 @@ impl Solver {
                     if matches.get(place).is_some_and(|m| (m.hit.piece, m.hit.tab) == (hit.piece, hit.tab)) {
                         continue;
                     }
-                    matches.insert(place, Match::new(hit, mouth, &outlines, (outline.scale, free), feet));
+                    matches.insert(place, Match::new(hit));
                     matches.truncate(most);
                     list.fits = None;
                 }

@@ -60,11 +60,8 @@ impl Assembler<'_> {
                 let this = (outline.serial, mouth);
                 let isthmus = |hit: &Hit| (self.outlines[hit.piece as usize].serial, hit.tab as usize);
                 let mut seen = self.memory.matches(this);
-                let mut look = |hit: Hit| match seen.remove(&isthmus(&hit)) {
-                    Some(known) => known.again(hit),
-                    None => Match::new(hit, segment, self.outlines, fit, feet),
-                };
-                let mut list: Vec<Match> = hits.into_iter().map(&mut look).collect();
+                let known = |hit: Hit| seen.remove(&isthmus(&hit)).map_or_else(|| Match::new(hit), |m| m.again(hit));
+                let mut list: Vec<Match> = hits.into_iter().map(known).collect();
                 let fits = matching::refine(&mut list, segment, self.outlines, fit, feet);
                 self.memory.keep_matches(this, list.into_iter().map(|m| (isthmus(&m.hit), m)).collect());
                 let joint =
