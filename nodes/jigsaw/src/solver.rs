@@ -307,7 +307,7 @@ impl Solver {
         let most = self.params.candidates;
         let free = self.params.fit_clearance;
         let whole = AtomicBool::new(true);
-        lists.par_iter_mut().enumerate().for_each_init(placement::Feet::default, |feet, (piece, (current, lists))| {
+        lists.par_iter_mut().enumerate().for_each(|(piece, (current, lists))| {
             if self.kept[piece].earlier {
                 return;
             }
@@ -319,7 +319,7 @@ impl Solver {
             let outline = outlines[piece];
             let index = if *current { &new } else { &all };
             lists.resize(outline.mouths.len(), List::default());
-            for (mouth, list) in outline.mouths.iter().zip(lists) {
+            outline.mouths.par_iter().zip(lists).for_each_init(placement::Feet::default, |feet, (mouth, list)| {
                 let matches = &mut list.matches;
                 for hit in index.nearest(mouth, piece as u32, &Windows::of(outline), most) {
                     // Ranks shift with each new id.
@@ -338,7 +338,7 @@ impl Solver {
                 }
                 let choose = || matching::refine(matches, mouth, &outlines, (outline.scale, free), feet);
                 list.fits.get_or_insert_with(choose);
-            }
+            });
             *current = true;
         });
         for (kept, (current, lists)) in self.kept.iter_mut().zip(lists) {

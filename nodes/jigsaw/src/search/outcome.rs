@@ -8,6 +8,7 @@ use super::learn::{AGREEMENT, IMPLAUSIBLE};
 use super::{Assembler, Mated, Outcome, edge};
 use crate::Policy;
 use crate::placement::{self, Joint};
+use rayon::prelude::*;
 use std::collections::BTreeMap;
 
 /// An island of at most so many pieces is stray if the largest is this many times as large: pieces that lie face down
@@ -147,6 +148,8 @@ impl Assembler<'_> {
     /// leaves, and as far as that explains how the joints of an assembly differ, they don't (empirical Bayes, Efron and
     /// Morris 1973).
     fn clearances(&self, joints: &[usize]) -> Vec<f64> {
+        /// Joints that one thread looks at before others are asked.
+        const JOINTS: usize = 8;
         let own = |k: &usize| {
             // All of the border where the pieces lie says more than the segment by which they were matched.
             let e = &self.edges[*k];
@@ -155,7 +158,7 @@ impl Assembler<'_> {
             let contact = (!paper).then(|| self.contact_of(e.a, e.b, &b_from_a, FINE)).flatten();
             contact.map_or((self.joints[*k].fit.clearance, 0.0), |c| (c.clearance, c.variance))
         };
-        let own: Vec<(f64, f64)> = joints.iter().map(own).collect();
+        let own: Vec<(f64, f64)> = joints.par_iter().with_min_len(JOINTS).map(own).collect();
         let mut clearances = vec![0.0; own.len()];
         let mut islands: BTreeMap<usize, Vec<usize>> = BTreeMap::new();
         for (i, k) in joints.iter().enumerate() {
