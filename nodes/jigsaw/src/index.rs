@@ -8,6 +8,7 @@
 //! O(n log n), a query O(k log n) on the clustered shapes of tabs (measured growth: see the benches).
 
 use crate::outline::{FLANK_SAMPLES, KEYS, Outline, SHAPE_SAMPLES, Segment};
+use crate::placement::turn;
 
 /// Entries a leaf of the tree holds: below this a linear scan is faster than descending.
 const LEAF: usize = 16;
@@ -215,14 +216,8 @@ pub(crate) fn shape_distance(a: &Segment, b: &Segment) -> f32 {
 /// Root mean square distance of the flanks of a tab from those of a mouth, in pixels, where the two are put on each other by the samples of
 /// their segments; what they have in common, and flanks that end at a corner of the piece, don't count.
 fn flank_distance(mouth: &Segment, tab: &Segment) -> f32 {
-    let (mut dot, mut cross) = (0.0, 0.0);
-    let [[xs, ys], [us, vs]] = [&tab.samples, &mouth.samples];
-    for (((x, y), u), v) in xs.iter().zip(ys).zip(us).zip(vs) {
-        dot += x * u + y * v;
-        cross += x * v - y * u;
-    }
-    let norm = dot.hypot(cross).max(f32::MIN_POSITIVE);
-    let (cos, sin) = (dot / norm, cross / norm);
+    let (cos, sin) = turn(tab, mouth);
+    let (cos, sin) = (cos as f32, sin as f32);
     let mut asides = [0f32; 2 * FLANK_SAMPLES];
     let mut count = 0;
     for end in 0..2 {

@@ -461,9 +461,11 @@ fn keys(shape: &[f32; SHAPE_SAMPLES]) -> [f32; KEYS] {
 fn drop_inner(points: &mut Vec<Point>) {
     const DIRECTIONS: [(f64, f64); 8] =
         [(1.0, 0.0), (1.0, 1.0), (0.0, 1.0), (-1.0, 1.0), (-1.0, 0.0), (-1.0, -1.0), (0.0, -1.0), (1.0, -1.0)];
+    /// Of points so many apart the extreme ones exclude hardly less.
+    const STRIDE: usize = 8;
     let Some(first) = points.first() else { return };
     let mut extreme = DIRECTIONS.map(|_| (f64::NEG_INFINITY, *first));
-    for p in points.iter() {
+    for p in points.iter().step_by(STRIDE) {
         for (best, (x, y)) in extreme.iter_mut().zip(DIRECTIONS) {
             let far = x * p.x + y * p.y;
             if far > best.0 {
@@ -475,11 +477,9 @@ fn drop_inner(points: &mut Vec<Point>) {
     let sides = std::array::from_fn::<_, 8, _>(|k| {
         let (a, b) = (extreme[k].1, extreme[(k + 1) % 8].1);
         let (nx, ny) = (a.y - b.y, b.x - a.x);
-        (nx, ny, -(nx * a.x + ny * a.y))
+        (nx, ny, if (nx, ny) == (0.0, 0.0) { f64::INFINITY } else { -(nx * a.x + ny * a.y) })
     });
-    points.retain(|p| {
-        sides.iter().any(|(nx, ny, offset)| nx * p.x + ny * p.y + offset <= 0.0 && (*nx, *ny) != (0.0, 0.0))
-    });
+    points.retain(|p| sides.iter().fold(false, |out, (nx, ny, offset)| out | (nx * p.x + ny * p.y + offset <= 0.0)));
 }
 
 /// Convex hull, running so that the turn is never negative.

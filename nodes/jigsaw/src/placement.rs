@@ -110,22 +110,28 @@ impl Pose {
 
 /// Best rigid pose of the samples of the two match segments, pair by pair (Umeyama 1991 without scale).
 fn first_pose(tab: &Segment, mouth: &Segment) -> Pose {
-    let (dot, cross) = widely!(products(&tab.samples, &mouth.samples));
-    let norm = dot.hypot(cross).max(f64::EPSILON);
-    let (cos, sin) = (dot / norm, cross / norm);
+    let (cos, sin) = turn(tab, mouth);
     let [ax, ay] = tab.middle.map(f64::from);
     let [bx, by] = mouth.middle.map(f64::from);
     Pose { cos, sin, x: bx - cos * ax + sin * ay, y: by - sin * ax - cos * ay }
 }
 
+/// Cosine and sine of the angle by which that pose turns.
+pub(crate) fn turn(tab: &Segment, mouth: &Segment) -> (f64, f64) {
+    let (dot, cross) = widely!(products(&tab.samples, &mouth.samples));
+    let norm = dot.hypot(cross).max(f64::EPSILON);
+    (dot / norm, cross / norm)
+}
+
 /// Sums of dot and cross products of points.
 #[inline(always)]
-fn products([ax, ay]: &[[f32; ROUGH_SAMPLES]; 2], [bx, by]: &[[f32; ROUGH_SAMPLES]; 2]) -> (f64, f64) {
+fn products(a: &[[f32; ROUGH_SAMPLES]; 2], b: &[[f32; ROUGH_SAMPLES]; 2]) -> (f64, f64) {
     let (mut dots, mut crosses) = ([0f32; LANES], [0f32; LANES]);
-    for k in (0..ROUGH_SAMPLES).step_by(LANES) {
+    let [[ax, ay], [bx, by]] = [a, b].map(|[x, y]| [x.as_chunks::<LANES>().0, y.as_chunks::<LANES>().0]);
+    for k in 0..ROUGH_SAMPLES / LANES {
         for l in 0..LANES {
-            dots[l] += ax[k + l] * bx[k + l] + ay[k + l] * by[k + l];
-            crosses[l] += ax[k + l] * by[k + l] - ay[k + l] * bx[k + l];
+            dots[l] += ax[k][l] * bx[k][l] + ay[k][l] * by[k][l];
+            crosses[l] += ax[k][l] * by[k][l] - ay[k][l] * bx[k][l];
         }
     }
     (f64::from(dots.iter().sum::<f32>()), f64::from(crosses.iter().sum::<f32>()))
@@ -164,14 +170,16 @@ struct Group {
 }
 
 impl Group {
-    /// Finds the nodes before the feet.
+    /// Finds the nodes before the feet, and gives those behind them.
     #[inline(always)]
-    fn look_up(&mut self, run: &[Node]) {
+    fn look_up(&mut self, run: &[Node]) -> Nodes {
         let most = (run.len() - 2) as f32;
         for l in 0..LANES {
             self.place[l] = self.at[l].floor().min(most);
         }
-        self.before = Nodes::of(run, &self.place);
+        let [before, behind] = Nodes::about(run, &self.place);
+        self.before = before;
+        behind
     }
 
     /// Moves the points and finds their feet near where they were: along the tangent, once. Rounds of refinement that
@@ -191,8 +199,8 @@ impl Group {
             moved[l] = self.place[l] + (along * step).clamp(-STRIDE, STRIDE);
             self.at[l] = moved[l].clamp(0.0, last);
         }
-        self.look_up(run);
-        let (a, b) = (&self.before, Nodes::of(&run[1..], &self.place));
+        let b = self.look_up(run);
+        let a = &self.before;
         for l in 0..LANES {
             let part = self.at[l] - self.place[l];
             let lerp = |p: f32, q: f32| p + (q - p) * part;
@@ -217,16 +225,18 @@ struct Nodes {
 }
 
 impl Nodes {
-    /// The nodes at some places, which are whole numbers.
+    /// The nodes at some places, which are whole numbers, and those that follow them.
     #[inline(always)]
-    fn of(run: &[Node], places: &[f32; LANES]) -> Self {
+    fn about(run: &[Node], places: &[f32; LANES]) -> [Self; 2] {
         /// Added to a whole number that is less, it leaves that in the lowest bits of the sum: unlike a cast, which has to mind
         /// what is no such number, in one instruction for all lanes.
         const SHIFT: f32 = 8_388_608.0;
-        let mut nodes = Self::default();
+        let mut nodes = [Self::default(); 2];
         for l in 0..LANES {
-            let node = &run[((places[l] + SHIFT).to_bits() - SHIFT.to_bits()) as usize];
-            (nodes.x[l], nodes.y[l], nodes.nx[l], nodes.ny[l]) = (node.x, node.y, node.nx, node.ny);
+            let place = ((places[l] + SHIFT).to_bits() - SHIFT.to_bits()) as usize;
+            for (nodes, node) in nodes.iter_mut().zip(&run[place..place + 2]) {
+                (nodes.x[l], nodes.y[l], nodes.nx[l], nodes.ny[l]) = (node.x, node.y, node.nx, node.ny);
+            }
         }
         nodes
     }
@@ -258,7 +268,9 @@ impl Feet {
                 group.present[l] = 1.0;
             }
         }
-        widely!(self.groups.iter_mut().for_each(|group| group.look_up(&mouth.run)));
+        widely!(self.groups.iter_mut().for_each(|group| {
+            group.look_up(&mouth.run);
+        }));
     }
 
     /// Starts with the samples of the match segment: they lie at equal parts of both.
@@ -308,19 +320,19 @@ impl Feet {
     #[inline(always)]
     fn gaps(&self, points: &std::ops::Range<usize>, clearance: f64, cap: f64) -> [f64; 3] {
         let (clearance, cap) = (clearance as f32, cap as f32);
-        let mut sums = [[0f64; LANES]; 4];
+        let mut sums = [[0f32; LANES]; 4];
         let groups = self.groups.iter().enumerate().take(points.end.div_ceil(LANES)).skip(points.start / LANES);
         for (k, group) in groups {
             for l in 0..LANES {
                 let here = if points.contains(&(k * LANES + l)) { group.mask[l] } else { 0.0 };
                 let distance = group.distance[l];
-                sums[0][l] += f64::from(here * (distance - clearance).abs().min(cap));
-                sums[1][l] += f64::from(here * (-distance).max(0.0));
-                sums[2][l] += f64::from(here * distance.max(0.0));
-                sums[3][l] += f64::from(here);
+                sums[0][l] += here * (distance - clearance).abs().min(cap);
+                sums[1][l] += here * (-distance).max(0.0);
+                sums[2][l] += here * distance.max(0.0);
+                sums[3][l] += here;
             }
         }
-        let [residual, overlap, gap, count] = sums.map(|lanes| lanes.iter().sum::<f64>());
+        let [residual, overlap, gap, count] = sums.map(|lanes| f64::from(lanes.iter().sum::<f32>()));
         [residual / count.max(1.0), overlap, gap]
     }
 
