@@ -77,7 +77,8 @@ impl Choice {
 }
 
 /// Poses and fits what has to be in a mouth's list and isn't yet, and gives the fits that stand: refined where
-/// the coarse one is good enough; `scale` is the scale of the mouth's piece, `free` whether the clearance is fitted. Which these are depends on the list alone, not on what was fitted while it was another.
+/// the coarse one is good enough. Which these are depends on the list alone, not on what was fitted while it was another.
+/// `scale` is the scale of the mouth's piece, `free` whether the clearance is fitted.
 pub(crate) fn refine(
     list: &mut [Match],
     mouth: &Segment,
