@@ -47,9 +47,9 @@ impl Ground {
         self.difference([column as f64, row as f64], hue, |c| clipping.level(blocks.planes[c][block]))
     }
 
-    /// What differs from the ground by more than this is no ground, whatever it is: shadows, glow, or print.
+    /// What differs from the ground by more than this is no ground, whatever it is: shadows, glow, or print. Of faint shapes it is what shapes differ by.
     pub(super) fn weak_threshold(&self) -> f32 {
-        (OUTLIER * self.scatter).max(MIN_RESIDUAL)
+        (OUTLIER * self.scatter).max(MIN_RESIDUAL).min(self.threshold)
     }
 
     /// The direction in which blocks of a colour frame differ from the ground, on the middle: that in which what the ground scatters by counts least
