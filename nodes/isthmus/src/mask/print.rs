@@ -72,6 +72,8 @@ pub(super) struct Print {
     depth: Vec<u8>,
     /// The place whose level tells how far a pixel is from ground to shape: itself if it lies that deep, or [`NOWHERE`].
     source: Vec<usize>,
+    /// How far off that is, squared; more than any if it is nowhere.
+    away: Vec<usize>,
     /// The level of the shape at a source.
     level: Vec<f32>,
     queue: VecDeque<usize>,
@@ -144,7 +146,8 @@ impl Print {
         let smooth = |plane: &Vec<f32>| box_mean(plane, [self.width, self.height], (blocks.size / 2).max(1));
         self.smooth = self.differences.iter().map(smooth).collect();
         let length = |k: usize| self.smooth.iter().map(|plane| plane[k] * plane[k]).sum::<f32>().sqrt();
-        self.length = (0..self.width * self.height).map(length).collect();
+        self.length.clear();
+        self.length.extend((0..self.width * self.height).map(length));
     }
 
     /// The levels of the crop with its print, in parts of the contrast, if there is any that its levels by blocks leave out.
@@ -271,23 +274,23 @@ impl Print {
 
     /// Finds for each pixel about the border the nearest place of a depth, and the levels there.
     fn find_sources(&mut self, deep: u8) {
-        let Self { width, height, depth, source, level, length, queue, .. } = self;
+        let Self { width, height, depth, source, away, level, length, queue, .. } = self;
         let (width, height) = (*width, *height);
         let most = (usize::from(deep) + BEYOND).pow(2);
-        let squared =
-            |a: usize, b: usize| (a % width).abs_diff(b % width).pow(2) + (a / width).abs_diff(b / width).pow(2);
-        let square = |k: usize, radius: usize| {
-            let (x, y) = (k % width, k / width);
+        let place = |k: usize| (k % width, k / width);
+        let square = |(x, y): (usize, usize), radius: usize| {
             let columns = x.saturating_sub(radius)..width.min(x + radius + 1);
             (y.saturating_sub(radius)..height.min(y + radius + 1))
-                .flat_map(move |v| columns.clone().map(move |u| v * width + u))
+                .flat_map(move |v| columns.clone().map(move |u| (u, v, v * width + u)))
         };
         source.clear();
         source.extend((0..depth.len()).map(|k| if depth[k] >= deep { k } else { NOWHERE }));
+        away.clear();
+        away.resize(depth.len(), most + 1);
         level.clear();
         level.resize(depth.len(), 1.0);
         for k in (0..depth.len()).filter(|k| depth[*k] == deep) {
-            let near = square(k, NEAR).filter(|j| depth[*j] == deep).map(|j| length[j]);
+            let near = square(place(k), NEAR).filter(|(.., j)| depth[*j] == deep).map(|(.., j)| length[j]);
             let (least, sum, count) =
                 near.fold((f32::MAX, 0.0, 0.0), |(least, sum, count), l| (l.min(least), sum + l, count + 1.0));
             let mean = sum / count;
@@ -295,10 +298,11 @@ impl Print {
             queue.push_back(k);
         }
         while let Some(k) = queue.pop_front() {
-            for j in square(k, 1).filter(|j| depth[*j] < deep) {
-                let distance = squared(j, source[k]);
-                if distance <= most && (source[j] == NOWHERE || distance < squared(j, source[j])) {
-                    source[j] = source[k];
+            let (x, y) = place(source[k]);
+            for (u, v, j) in square(place(k), 1).filter(|(.., j)| depth[*j] < deep) {
+                let distance = u.abs_diff(x).pow(2) + v.abs_diff(y).pow(2);
+                if distance < away[j] {
+                    (source[j], away[j]) = (source[k], distance);
                     queue.push_back(j);
                 }
             }

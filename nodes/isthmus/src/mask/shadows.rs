@@ -335,12 +335,12 @@ impl Shadows {
 
 /// The four neighbours of a pixel, as many as there are.
 pub(super) fn neighbours(k: usize, width: usize, height: usize) -> impl Iterator<Item = usize> {
-    let (x, y) = (k % width, k / width);
+    let x = k % width;
     let list = [
         (x > 0, k.wrapping_sub(1)),
         (x + 1 < width, k + 1),
-        (y > 0, k.wrapping_sub(width)),
-        (y + 1 < height, k + width),
+        (k >= width, k.wrapping_sub(width)),
+        (k + width < width * height, k + width),
     ];
     list.into_iter().filter(|(is_there, _)| *is_there).map(|(_, k)| k)
 }
