@@ -12,9 +12,9 @@ pub(super) const COARSE: f64 = 0.05;
 pub(super) const FINE: f64 = 0.02;
 /// Contact of outlines is looked for within this distance, in piece scales.
 const CONTACT_BAND: f64 = 0.035;
-/// Pairs of pieces that one thread looks at before others are asked: most contacts are remembered, and to wake a thread takes as
-/// long as some tens of them.
-const PAIRS: usize = 64;
+/// Pairs of pieces that one thread looks at before others are asked: to wake a thread takes as long as some contacts that are new, or some
+/// tens that are remembered.
+const PAIRS: usize = 16;
 
 impl Assembler<'_> {
     /// Pairs of pieces of one island near enough to touch.
