@@ -66,9 +66,10 @@ impl Ground {
         };
         let middle = [channel(0, red), channel(1, green), channel(2, blue)];
         let whiten = |d| self.metric.as_ref().map_or(d, |metric| metric.whiten(d));
-        let colour =
-            list.get(list.len() / 2).map_or([0.0; 3], |&(column, row)| self.colour([column as f64, row as f64]));
-        let [white, light] = [whiten(middle), colour].map(Vector3::from);
+        let colour = list
+            .get(list.len() / 2)
+            .map_or([0.0; 3], |&(column, row)| [red, green, blue].map(|surface| surface.at(column as f64, row as f64)));
+        let [white, light] = [middle, colour].map(|d| Vector3::from(whiten(d)));
         let light = light.try_normalize(f32::MIN_POSITIVE).unwrap_or_default();
         let across = white - light * (white.dot(&light) * SHADOWS / (1.0 + SHADOWS));
         let scale = white.amax() / across.dot(&white);
@@ -93,13 +94,6 @@ impl Ground {
         let level = |mean: f32| self.clipping.as_ref().map_or(mean, |clipping| clipping.level(mean));
         let middle = [&columns, &rows].map(|range| (range.start + range.end - 1) as f64 / 2.0);
         (middle, self.difference(middle, hue, |c| level(mean(&blocks.planes[c]))))
-    }
-
-    /// The colour of the ground at a block, in the metric.
-    pub(super) fn colour(&self, [column, row]: [f64; 2]) -> [f32; MAX_CHANNELS] {
-        let mut colour = [0.0; MAX_CHANNELS];
-        colour.iter_mut().zip(&self.surfaces).for_each(|(level, surface)| *level = surface.at(column, row));
-        self.metric.as_ref().map_or(colour, |metric| metric.whiten(colour))
     }
 
     /// The ground along a row, from a column in steps.

@@ -4,29 +4,33 @@
 //! The border of print lies half-way between the ground and the shape's level close by, which blocks of pixels tell as long as it varies little from one to the next. A dark
 //! tab on a dark ground is beyond half-way nowhere then, and lost.
 //! 1. *Reach*: what stands out from the ground at all, however little, and hangs together with the shape; holes filled.
-//! 2. *Trial*: the border half-way to the level of the nearest place within it beyond the blur of the edge.
-//! 3. *Verdict*, where that is another border than half-way to the levels by blocks: what lies between the two is print if the trial's border is about as crisp there, over some pixels
-//!    along it, as the rest of the border, and the level beside it is no glare's. Shadows and glow rise slowly. If most of it has the colour that the ground has in shadow, all stays as it was.
-//! 4. *Result*: the same border once more, without what is no print.
+//! 2. *Weak parts* of it: what lies deeper in it than an edge is wide, and is not half-way to the shape's level.
+//! 3. *Trial*: the border half-way to the level of the nearest place beyond the blur of the edge, weak parts being shape.
+//! 4. *Verdict*: a weak part is print if its border is about as sharp as that of the rest, beside the level that the part has further in. Shadows and glow rise slowly.
+//! 5. *Result*: the same border once more, without what is no print.
 //!
 //! # Cost
-//! Linear in the pixels of the crop, and some tens of bytes for each; only for shapes whose level is that of print, or with weak blocks deep within their reach: some ten milliseconds for one of 200 px.
+//! Linear in the pixels of the crop, and some tens of bytes for each; only for shapes whose level is that of print, some ten milliseconds for one of 200 px.
 
 use super::crop::Crop;
 use super::frame::Frame;
 use super::levels::in_blocks;
 use super::shadows::{box_mean, neighbours};
 use super::standing::{NOBODY, Standing};
-use super::statistics::median;
+use super::statistics::{median, quantile};
 use std::collections::VecDeque;
 
 /// Larger crops are left as they are: pieces are smaller, and each pixel takes some tens of bytes.
 const MOST_PIXELS: usize = 1 << 22;
+/// A weak part has so many pixels: fewer are what noise leaves of an edge.
+const LEAST_PART: usize = 12;
+/// Print of less than one in so many of a shape's pixels is not worth another border: the blocks' is smoother.
+const LEAST_SHARE: usize = 1_000;
 /// Depths that are told apart, in pixels: no edge worth measuring is wider.
 const MAX_DEPTH: u8 = 24;
-/// An edge's blur is left behind where the median level is this part of the shape's: of that at places so many pixels further in, or of that at near places.
-const SETTLED: f32 = 0.93;
-const FURTHER: u8 = 3;
+/// An edge's blur is left behind where the median level is this part of the shape's: in the blocks' levels, which are those of deep within, and in levels by near places.
+const SETTLED: f32 = 0.85;
+const SETTLED_NEAR: f32 = 0.93;
 /// How far beyond the depth where levels are measured pixels are told by them: an edge's blur, and some more.
 const BEYOND: usize = 8;
 /// Half the side of the square over which the nearest level is measured.
@@ -42,22 +46,14 @@ const LEAST_APART: f32 = 0.25;
 /// How far inside and outside of the border levels are compared, in pixels from the last one within.
 const INSIDE: f32 = 1.5;
 const OUTSIDE: f32 = 2.5;
-/// Half the side of the square over which the border's crispness is measured, in pixels.
-const ALONG: usize = 8;
-/// Least step of print, as a part of the median step of the rest: of shadows in rendered scenes nine of ten have less than 0.56, of print three of four more.
+/// Which of the steps along a part's border counts: at some places other print lies beside it.
+const TYPICAL: f64 = 0.35;
+/// Least step of print, as a part of the median step of the rest: of shadows in rendered scenes nine of ten have less than 0.56, of print three of four more than 0.6.
 const CRISP: f32 = 0.6;
+/// ... and of what may be print beside such.
+const SOFT: f32 = 0.4;
 /// How far beyond the levels of ground and shape noise may go, as a part of the contrast.
 const OVERSHOOT: f32 = 0.2;
-/// Cosine of the angle between a difference and that of black from which on it is one in brightness alone.
-const SAME_HUE: f32 = 0.9;
-/// What stands out by less than this part of the level of the rest may be glare: a scanner's lid and lens leave 0.04 to 0.17 beside bright pieces...
-const FAINT: f32 = 0.2;
-/// ... most of it less than this, ...
-const FAINTEST: f32 = 0.1;
-/// ... and what is more has seldom such steps.
-const CRISP_IF_FAINT: f32 = 0.8;
-/// Beside shadows more than this part of the doubtful border has their colour (0.8 to 1), beside print of many colours less (up to 0.4).
-const SHADED: f32 = 0.6;
 /// No place.
 const NOWHERE: usize = usize::MAX;
 
@@ -72,8 +68,6 @@ pub(super) struct Print {
     smooth: Vec<Vec<f32>>,
     /// Length of these.
     length: Vec<f32>,
-    /// The ground's colour in the middle, in the metric: black is as far from it the other way.
-    ground: [f32; 3],
     /// Depth within the reach or the border found last, in steps from pixel to pixel.
     depth: Vec<u8>,
     /// The place whose level tells how far a pixel is from ground to shape: itself if it lies that deep, or [`NOWHERE`].
@@ -83,6 +77,14 @@ pub(super) struct Print {
     /// The level of the shape at a source.
     level: Vec<f32>,
     queue: VecDeque<usize>,
+}
+
+/// Parts of a picture.
+struct Parts {
+    /// Which one each pixel belongs to; 0 for the rest.
+    of: Vec<usize>,
+    /// Their pixels, from 1 on.
+    lists: Vec<Vec<usize>>,
 }
 
 impl Crop {
@@ -100,9 +102,7 @@ impl Crop {
         let range = self.shape_level - self.ground_level;
         let by_blocks: Vec<f32> = self.pixels.iter().map(|p| (f32::from(*p) - self.ground_level) / range).collect();
         print.measure(self, frame, standing, k);
-        let Some(levels) = print.find(&by_blocks, standing.ground.weak_threshold(), self.is_print) else {
-            return false;
-        };
+        let Some(levels) = print.find(&by_blocks, standing.ground.weak_threshold()) else { return false };
         for (pixel, level) in self.pixels.iter_mut().zip(levels) {
             let level = level.clamp(-OVERSHOOT, 1.0 + OVERSHOOT);
             *pixel = (self.ground_level + range * level).round().clamp(0.0, 255.0) as u8;
@@ -145,102 +145,52 @@ impl Print {
         }
         let smooth = |plane: &Vec<f32>| box_mean(plane, [self.width, self.height], (blocks.size / 2).max(1));
         self.smooth = self.differences.iter().map(smooth).collect();
-        self.ground = ground.colour(
-            [(crop.x, self.width), (crop.y, self.height)]
-                .map(|(from, side)| (f64::from(from) + side as f64 / 2.0) / blocks.size as f64),
-        );
         let length = |k: usize| self.smooth.iter().map(|plane| plane[k] * plane[k]).sum::<f32>().sqrt();
         self.length.clear();
         self.length.extend((0..self.width * self.height).map(length));
     }
 
     /// The levels of the crop with its print, in parts of the contrast, if there is any that its levels by blocks leave out.
-    fn find(&mut self, by_blocks: &[f32], threshold: f32, is_print: bool) -> Option<Vec<f32>> {
+    fn find(&mut self, by_blocks: &[f32], threshold: f32) -> Option<Vec<f32>> {
         let stands_out = |k: usize| self.smooth.iter().any(|plane| plane[k].abs() > threshold);
         let stands_out: Vec<bool> = (0..self.length.len()).map(stands_out).collect();
         self.find_depth(|k| stands_out[k] && by_blocks[k] > 0.5, |k| stands_out[k]);
-        let deep = self.plateau()?;
-        self.find_sources(deep);
-        let trial: Vec<f32> = (0..self.length.len()).map(|k| self.relative(k, k)).collect();
-        self.follow(&trial)?;
-        let is_elsewhere = self.is_elsewhere(by_blocks, &trial);
-        let is_crisp = self.crisp(by_blocks, &is_elsewhere)?;
-        let near =
-            |print: &Self, k: usize| if print.source[k] == NOWHERE { by_blocks[k] } else { print.relative(k, k) };
-        let second = |k: usize| if is_crisp[k] { near(self, k) } else { by_blocks[k] };
-        let second: Vec<f32> = (0..by_blocks.len()).map(second).collect();
-        self.follow(&second)?;
-        let is_nick = self.nicks(&second, &stands_out);
-        let third = |k: usize| if is_nick[k] { 1.0 } else { near(self, k) };
-        let third: Vec<f32> = (0..by_blocks.len()).map(third).collect();
-        let is_elsewhere = self.is_elsewhere(by_blocks, &third);
-        // The blocks' levels of a shape of one level are better than those of near places where they tell it.
-        let result = |k: usize| if is_elsewhere[k] && (is_print || is_crisp[k]) { third[k] } else { by_blocks[k] };
-        Some((0..by_blocks.len()).map(result).collect())
-    }
-
-    /// The depth within the reach from which on levels are the shape's own: on the middle they do not change further in.
-    fn plateau(&self) -> Option<u8> {
-        let mut steps: [Vec<f32>; MAX_DEPTH as usize] = Default::default();
-        let inner = |k: usize| neighbours(k, self.width, self.height).find(|j| self.depth[*j] == self.depth[k] + 1);
-        for k in (0..self.depth.len()).filter(|k| (1..MAX_DEPTH - FURTHER).contains(&self.depth[*k])) {
-            if let Some(further) = (0..FURTHER).try_fold(k, |k, _| inner(k)) {
-                steps[usize::from(self.depth[k])].push(self.length[k] / self.length[further].max(f32::MIN_POSITIVE));
-            }
-        }
-        (2..MAX_DEPTH - FURTHER).find(|depth| median(&steps[usize::from(*depth)]) >= SETTLED)
-    }
-
-    /// Near which parts of the border what it takes in is print, if any.
-    fn crisp(&self, by_blocks: &[f32], is_elsewhere: &[bool]) -> Option<Vec<bool>> {
-        let count = self.depth.len();
-        let [mut steps, mut levels, mut places] = [(); 3].map(|()| vec![0.0; count]);
-        let (mut usual, mut shadows) = (Vec::new(), 0);
-        for k in (0..count).filter(|k| self.depth[*k] == 1 && self.source[*k] != NOWHERE) {
-            if !is_elsewhere[k] {
-                usual.push(self.step(k));
-            } else if by_blocks[k] <= 0.5 {
-                let level = self.level[self.source[k]];
-                shadows += usize::from(self.may_be_shadow(k));
-                (steps[k], levels[k], places[k]) = (level * self.step(k), level, 1.0);
-            }
-        }
-        if shadows as f32 >= SHADED * places.iter().sum::<f32>() {
+        let deep = self.settled(by_blocks, SETTLED)?;
+        let strong = self.parts(|k| by_blocks[k] > 0.5);
+        let body = (1..strong.lists.len()).max_by_key(|part| strong.lists[*part].len())?;
+        let parts = self.parts(|k| self.depth[k] >= deep && strong.of[k] != body);
+        // Those that do not come near the border are shape anyway.
+        let matters = |part: &Vec<usize>| part.len() >= LEAST_PART && part.iter().any(|k| self.depth[*k] == deep);
+        if !parts.lists.iter().any(matters) {
             return None;
         }
-        let usual = median(&usual);
-        let body = (0..count).filter(|k| by_blocks[*k] > 0.5).map(|k| self.length[k]).collect::<Vec<_>>();
-        let body = median(&body);
-        let [steps, levels, places] = [steps, levels, places].map(|l| box_mean(&l, [self.width, self.height], ALONG));
-        let is_print = |k: usize| {
-            let crisp = if levels[k] < FAINT * body * places[k] { CRISP_IF_FAINT } else { CRISP };
-            levels[k] > FAINTEST * body * places[k] && steps[k] >= crisp * usual * levels[k]
+        let area = self.depth.iter().filter(|depth| **depth > 0).count();
+        self.find_sources(deep);
+        let nearest: Vec<usize> = self.source.iter().map(|s| parts.of.get(*s).map_or(NOWHERE, |part| *part)).collect();
+        let trial: Vec<f32> = (0..self.length.len()).map(|k| self.relative(k, k)).collect();
+        self.follow(&trial)?;
+        let crispness = self.crispness(&parts, &nearest);
+        let counts = |(crispness, list): (&f32, &Vec<usize>)| if *crispness >= CRISP { list.len() } else { 0 };
+        let lost: usize = crispness.iter().zip(&parts.lists).skip(1).map(counts).sum();
+        if lost < LEAST_PART || lost * LEAST_SHARE < area {
+            return None;
+        }
+        let level = |k: usize| match crispness.get(nearest[k]) {
+            Some(crispness) if *crispness >= SOFT => self.relative(k, k),
+            _ => by_blocks[k],
         };
-        let is_print: Vec<bool> = (0..count).map(is_print).collect();
-        (usual > 0.0 && is_print.contains(&true)).then_some(is_print)
-    }
-
-    /// Whether a pixel differs from the ground as if there were less light on it.
-    fn may_be_shadow(&self, k: usize) -> bool {
-        let along: f32 = self.smooth.iter().zip(self.ground).map(|(plane, g)| plane[k] * g).sum();
-        let ground = self.ground.iter().map(|g| g * g).sum::<f32>().sqrt();
-        along < -SAME_HUE * ground * self.length[k]
-    }
-
-    /// The step across the border at a pixel of it, as a part of the level further in.
-    fn step(&self, k: usize) -> f32 {
-        let source = self.source[k];
-        let place = |k: usize| [(k % self.width) as f32, (k / self.width) as f32];
-        let ([x, y], [u, v]) = (place(k), place(source));
-        let away = (x - u).hypot(y - v).max(1.0);
-        let at = |steps: f32| {
-            let along = |from: f32, to: f32, count: usize| {
-                (from + steps * (from - to) / away).round().clamp(0.0, (count - 1) as f32) as usize
-            };
-            self.relative(along(y, v, self.height) * self.width + along(x, u, self.width), k)
-                .clamp(-OVERSHOOT, 1.0 + OVERSHOOT)
+        let second: Vec<f32> = (0..self.length.len()).map(level).collect();
+        self.follow(&second)?;
+        let is_nick = self.nicks(&second, &stands_out);
+        let result = |k: usize| match self.source[k] {
+            _ if is_nick[k] => 1.0,
+            NOWHERE => by_blocks[k],
+            _ => self.relative(k, k),
         };
-        at(-INSIDE) - at(OUTSIDE)
+        let near: Vec<f32> = (0..self.length.len()).map(result).collect();
+        let is_elsewhere = self.is_elsewhere(by_blocks, &near);
+        let chosen = near.iter().zip(by_blocks).zip(is_elsewhere);
+        Some(chosen.map(|((near, by_blocks), is_elsewhere)| if is_elsewhere { *near } else { *by_blocks }).collect())
     }
 
     /// Depth within what is set and hangs together with seeds, which are set; holes filled.
@@ -289,12 +239,37 @@ impl Print {
     }
 
     /// The depth from which on levels are the shape's own, the edge's blur left behind.
-    fn settled(&self, levels: &[f32]) -> Option<u8> {
+    fn settled(&self, levels: &[f32], part: f32) -> Option<u8> {
         let mut by_depth: [Vec<f32>; MAX_DEPTH as usize + 1] = Default::default();
         for (depth, level) in self.depth.iter().zip(levels).filter(|(depth, _)| (1..=MAX_DEPTH).contains(*depth)) {
             by_depth[usize::from(*depth)].push(*level);
         }
-        (2..MAX_DEPTH).find(|depth| median(&by_depth[usize::from(*depth)]) >= SETTLED)
+        (2..MAX_DEPTH).find(|depth| median(&by_depth[usize::from(*depth)]) >= part)
+    }
+
+    /// What is set, in parts that hang together.
+    fn parts(&self, is_set: impl Fn(usize) -> bool) -> Parts {
+        let mut parts = Parts { of: vec![0; self.depth.len()], lists: vec![Vec::new()] };
+        for seed in 0..self.depth.len() {
+            let is_open = |k: usize, of: &[usize]| of[k] == 0 && is_set(k);
+            if !is_open(seed, &parts.of) {
+                continue;
+            }
+            let (label, mut list) = (parts.lists.len(), vec![seed]);
+            parts.of[seed] = label;
+            let mut next = 0;
+            while let Some(&k) = list.get(next) {
+                next += 1;
+                for j in neighbours(k, self.width, self.height) {
+                    if is_open(j, &parts.of) {
+                        parts.of[j] = label;
+                        list.push(j);
+                    }
+                }
+            }
+            parts.lists.push(list);
+        }
+        parts
     }
 
     /// Finds for each pixel about the border the nearest place of a depth, and the levels there.
@@ -349,7 +324,7 @@ impl Print {
     /// Takes the border of a shape from levels, and the sources about it.
     fn follow(&mut self, levels: &[f32]) -> Option<()> {
         self.find_depth(|k| levels[k] > 0.5, |k| levels[k] > 0.5);
-        let deep = self.settled(levels)?;
+        let deep = self.settled(levels, SETTLED_NEAR)?;
         self.find_sources(deep + 1);
         Some(())
     }
@@ -385,5 +360,37 @@ impl Print {
     fn eroded(&self, set: &[bool], radius: usize) -> Vec<bool> {
         let open: Vec<bool> = set.iter().map(|set| !set).collect();
         self.dilated(&open, radius).into_iter().map(|open| !open).collect()
+    }
+
+    /// How crisp the border is at each part, as a part of what it is at the rest of the shape; `nearest` tells which part a pixel is nearest to.
+    fn crispness(&self, parts: &Parts, nearest: &[usize]) -> Vec<f32> {
+        let plateau = |part: &Vec<usize>| median(&part.iter().map(|k| self.length[*k]).collect::<Vec<_>>());
+        let plateaus: Vec<f32> = parts.lists.iter().map(plateau).collect();
+        let mut steps = vec![Vec::new(); parts.lists.len()];
+        let place = |k: usize| [(k % self.width) as f32, (k / self.width) as f32];
+        for k in (0..self.depth.len()).filter(|k| self.depth[*k] == 1) {
+            let (source, part) = (self.source[k], nearest[k]);
+            if source == NOWHERE || part == NOWHERE {
+                continue;
+            }
+            let ([x, y], [u, v]) = (place(k), place(source));
+            let away = (x - u).hypot(y - v).max(1.0);
+            let at = |steps: f32| {
+                let along = |from: f32, to: f32, count: usize| {
+                    (from + steps * (from - to) / away).round().clamp(0.0, (count - 1) as f32) as usize
+                };
+                self.relative(along(y, v, self.height) * self.width + along(x, u, self.width), k)
+                    .clamp(-OVERSHOOT, 1.0 + OVERSHOOT)
+            };
+            let share = if part == 0 { 1.0 } else { (self.level[source] / plateaus[part]).min(1.0) };
+            steps[part].push(share * (at(-INSIDE) - at(OUTSIDE)));
+        }
+        let usual = median(&steps[0]);
+        let crispness = |steps: &Vec<f32>| {
+            if steps.is_empty() || usual <= 0.0 { SOFT } else { quantile(steps, TYPICAL) / usual }
+        };
+        let list = parts.lists.iter().zip(&steps).enumerate();
+        list.map(|(part, (list, steps))| if part > 0 && list.len() >= LEAST_PART { crispness(steps) } else { SOFT })
+            .collect()
     }
 }
