@@ -168,7 +168,7 @@ impl Segmenter {
             self.crop.take(frame, &standing, k);
             self.crop.label(&mut self.fine);
             let mut beside = self.crop.lift_shadows(&self.fine, &mut self.shadows, parameters);
-            let recovered = self.crop.is_print && self.crop.recover_print(frame, &standing, k, &mut self.print);
+            let recovered = self.crop.may_be_more && self.crop.recover_print(frame, &standing, k, &mut self.print);
             beside.is_doubtful |= recovered;
             if beside.is_shaded || recovered {
                 self.crop.label(&mut self.fine);

@@ -238,6 +238,28 @@ fn print_near_the_level_of_the_ground() {
     }
 }
 
+/// Dark print on black, as a scanner with an open lid sees it: on two pieces most of it is dark, so that as much of the frame is dark as is bright, and blocks of it lie nearer to the ground than to
+/// bright print; on the others a tab or a corner, while the rest has one level.
+#[test]
+fn dark_print_on_black() {
+    const DARK: [f64; 3] = [42.0, 40.0, 38.0];
+    const BRIGHT: [[f64; 3]; 4] =
+        [[215.0, 205.0, 190.0], [120.0, 160.0, 220.0], [225.0, 120.0, 105.0], [200.0, 200.0, 195.0]];
+    /// Dark from here on, to the right of the piece's middle, as a part of its size.
+    const FROM: [f64; 4] = [-0.3, -0.25, 0.36, 0.4];
+    let (coverage, necks) = coverage();
+    let mut rng = StdRng::seed_from_u64(31);
+    let mut pixels = Vec::with_capacity(3 * coverage.len());
+    for (k, c) in coverage.iter().enumerate() {
+        let (x, y) = ((k % SIDE) as f64, (k / SIDE) as f64);
+        let piece = 2 * usize::from(y > SIDE as f64 / 2.0) + usize::from(x > SIDE as f64 / 2.0);
+        let print = if x - CENTRES[piece].0 > FROM[piece] * SIZE { DARK } else { BRIGHT[piece] };
+        pixels.extend(print.map(|level| (level * c + 2.0 * normal(&mut rng)).round().clamp(0.0, 255.0) as u8));
+    }
+    let frame = Frame::rgb(SIDE as u32, SIDE as u32, &pixels).unwrap();
+    check(&segment(&frame, &Parameters::default()), &necks, "dark print on black");
+}
+
 /// Light that falls off to the left and to all corners: the brightest ground has five times the level of the darkest, pieces three
 /// quarters of that of the ground round them. No level tells the two apart.
 #[test]

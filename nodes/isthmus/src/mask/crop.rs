@@ -47,6 +47,8 @@ pub(super) struct Crop {
     pub(super) contrast: f32,
     /// Whether that is one of print, block by block.
     pub(super) is_print: bool,
+    /// Whether parts of it may come near the ground's level: it is print, or has weak blocks.
+    pub(super) may_be_more: bool,
 }
 
 impl Crop {
@@ -56,7 +58,8 @@ impl Crop {
         let (block, columns) = (blocks.size, blocks.columns);
         let levels = Levels::of(standing, k);
         self.is_print = levels.is_print();
-        let c = if self.is_print { standing.reach(k) } else { components.list[k] };
+        self.may_be_more = self.is_print || standing.has_weak_part(k, levels.contrast);
+        let c = if self.may_be_more { standing.reach(k) } else { components.list[k] };
         let margin = MARGIN + block;
         let mut rows = RowSource { frame, ground, block, lines: Default::default() };
         (self.x, self.y) = ((c.left * block) as i32 - margin as i32, (c.top * block) as i32 - margin as i32);

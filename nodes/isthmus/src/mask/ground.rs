@@ -10,10 +10,11 @@
 use super::blocks::{Blocks, NOISE_STEP, Sample};
 use super::clipping::Clipping;
 use super::metric::Metric;
-use super::statistics::{NORMAL_MAD, median, otsu};
+use super::statistics::{Histogram, NORMAL_MAD, Split, median};
 use super::surface::{AlongRow, Surface};
 use crate::wide::widely;
 use nalgebra::Vector3;
+use std::ops::Range;
 
 /// The ground and what stands out from it.
 #[derive(Debug, Clone, Default)]
@@ -96,6 +97,19 @@ impl Ground {
         (middle, self.difference(middle, hue, |c| level(mean(&blocks.planes[c]))))
     }
 
+    /// Whether a block may be ground in a shadow: darker, and of about the same hue.
+    pub(super) fn may_be_shaded(&self, blocks: &Blocks, (column, row): (usize, usize)) -> bool {
+        let block = row * blocks.columns + column;
+        let mut parts = blocks
+            .planes
+            .iter()
+            .zip(&self.surfaces)
+            .map(|(plane, surface)| plane[block] / surface.at(column as f64, row as f64).max(1.0));
+        let first = parts.next().map_or((0.0, 0.0), |part| (part, part));
+        let (least, most) = parts.fold(first, |(least, most), part| (least.min(part), most.max(part)));
+        most < 1.0 && most - least <= SHADED * (1.0 - most).max(1.0 - least)
+    }
+
     /// The ground along a row, from a column in steps.
     pub(super) fn along(&self, row: f64, column: f64, step: f64) -> GroundRow<'_> {
         let mut levels = [AlongRow::default(); MAX_CHANNELS];
@@ -134,6 +148,9 @@ pub(super) struct Hue {
 
 /// How much the ground's brightness is taken to vary beside pieces, as a part of the variance by noise: shadows count less then, and noise a sixteenth more at most.
 const SHADOWS: f32 = 1.0;
+
+/// By how much the channels' parts of the light of a shaded ground differ at most, as a part of what is missing of it.
+const SHADED: f32 = 0.4;
 
 /// Channels of a colour frame.
 const MAX_CHANNELS: usize = 3;
@@ -227,6 +244,18 @@ const RIM_SAMPLES: usize = 64;
 /// the rim about half the rim is shape.
 const SURE_SHARE: f64 = 0.62;
 
+/// Share of the rim from which that what is not of it is no ground.
+const CLEAN_SHARE: f64 = 0.95;
+/// Share of a class that the part of it along the rim has at least, if it is ground: a surface through less does not tell the rest.
+const LEAST_SHARE: f64 = 0.5;
+/// One in so many blocks make no class of print: the edges of shapes are so many.
+const FEW: f64 = 50.0;
+/// How much denser levels are on the half way from such a class to the ground than in the class, from which on it is light that falls off: of what does so in inverse proportion to its
+/// distance, or as a normal distribution, at least twice.
+const FALLING: f64 = 2.0;
+/// All levels.
+const ALL: Range<f32> = 0.0..256.0;
+
 /// A class of blocks taken for ground.
 pub(super) struct Candidate {
     /// Whether each block of [`Blocks::samples`] is ground.
@@ -273,19 +302,54 @@ pub(super) fn candidates(blocks: &Blocks) -> impl Iterator<Item = (Candidate, bo
                 Channel::Plane(c) => blocks.sampled[*c].clone(),
                 _ => blocks.samples.iter().map(|s| channel.at(planes, s.block)).collect(),
             };
-            let split = otsu(&values);
-            (channel, values, split)
+            let histogram = Histogram::of(&values);
+            let split = histogram.split(ALL);
+            (channel, values, histogram, split)
         })
-        .max_by(|a, b| a.2.separation.total_cmp(&b.2.separation));
-    best.into_iter().flat_map(move |(channel, values, split)| {
-        let bright = rim.iter().filter(|&&k| channel.at(planes, k) > split.threshold).count();
+        .max_by(|a, b| a.3.separation.total_cmp(&b.3.separation));
+    best.into_iter().flat_map(move |(channel, values, histogram, split)| {
+        let rim: Vec<f32> = rim.iter().map(|&k| channel.at(planes, k)).collect();
+        let bright = rim.iter().filter(|v| **v > split.threshold).count();
         let share = bright as f64 / rim.len().max(1) as f64;
         let is_told = share.max(1.0 - share) >= SURE_SHARE;
-        let class = move |bright: bool| values.iter().map(|v| (*v > split.threshold) == bright).collect();
+        let class = move |bright: bool| {
+            let whole = if bright { split.threshold..ALL.end } else { ALL.start..split.threshold };
+            let class = rim_class(&values, &histogram, &rim, whole);
+            values.iter().map(|v| class.contains(v)).collect()
+        };
         let candidates =
             [share > 0.5, share <= 0.5].into_iter().map(move |bright| Candidate { is_ground: class(bright) });
         candidates.filter(|c| c.is_ground.contains(&true)).map(move |candidate| (candidate, is_told))
     })
+}
+
+/// The part of a class of levels that the rim is of, if it is most of it: what else is of that class is print.
+fn rim_class(values: &[f32], histogram: &Histogram, rim: &[f32], class: Range<f32>) -> Range<f32> {
+    let count = |values: &[f32], class: &Range<f32>| values.iter().filter(|v| class.contains(v)).count() as f64;
+    let split = histogram.split(class.clone());
+    let [all, along_rim] = [count(values, &class), count(rim, &class)];
+    let is_ground = |part: &Range<f32>| {
+        along_rim > 0.0
+            && count(rim, part) >= CLEAN_SHARE * along_rim
+            && count(values, part) >= LEAST_SHARE * all
+            && is_apart(histogram, &class, &split, part)
+    };
+    let parts = [class.start..split.threshold, split.threshold..class.end];
+    match parts.into_iter().find(is_ground) {
+        Some(part) => rim_class(values, histogram, rim, part),
+        None => class,
+    }
+}
+
+/// Whether what is of a class and not of its part that is ground is one of its own, and not few: there are fewer levels on the way to it. Of light that falls off there are more the nearer to
+/// the ground.
+fn is_apart(histogram: &Histogram, class: &Range<f32>, split: &Split, ground: &Range<f32>) -> bool {
+    let (mean, end) =
+        if ground.start == class.start { (split.mean_below, class.end) } else { (split.mean_above, class.start) };
+    let [all, _] = histogram.between([class.start, class.end]);
+    let [on_the_way, distance] = histogram.between([split.threshold, (split.threshold + mean) / 2.0]);
+    let [apart, width] = histogram.between([split.threshold, end]);
+    apart * FEW >= all && on_the_way / distance < FALLING * apart / width
 }
 
 /// The blocks along the rim, at several depths.
@@ -313,10 +377,32 @@ pub(super) fn find(blocks: &Blocks, candidate: Candidate, residual: Vec<f32>) ->
 
 /// The rim taken for ground: a surface through it runs under all shapes, whatever the light.
 fn along_rim(blocks: &Blocks) -> Candidate {
+    Candidate { is_ground: blocks.samples.iter().map(|s| is_along_rim(blocks, s)).collect() }
+}
+
+/// Whether a block lies as near to the frame's edge as those that vote for the ground.
+fn is_along_rim(blocks: &Blocks, sample: &Sample) -> bool {
     let (columns, rows) = (blocks.columns, blocks.rows);
     let depth = (RIM_DEPTHS[RIM_DEPTHS.len() - 1] * columns.min(rows) as f64) as usize;
     let is_near = |at: u32, count: usize| at as usize <= depth || at as usize + depth + 1 >= count;
-    Candidate { is_ground: blocks.samples.iter().map(|s| is_near(s.column, columns) || is_near(s.row, rows)).collect() }
+    is_near(sample.column, columns) || is_near(sample.row, rows)
+}
+
+/// Where the ground ends among residuals below a limit, if a class of them stands out from it that hardly reaches the rim.
+fn nearer_class<I: Iterator<Item = f32>>(
+    histogram: &Histogram,
+    limit: f32,
+    sigma: f32,
+    rim: impl Fn() -> I,
+) -> Option<f32> {
+    let split = histogram.split(0.0..limit);
+    let nearer = split.threshold.max(OUTLIER * sigma).max(MIN_RESIDUAL);
+    let stands_out = nearer < limit && split.mean_above >= CLEAR * sigma;
+    if !stands_out || !is_apart(histogram, &(0.0..limit), &split, &(0.0..split.threshold)) {
+        return None;
+    }
+    let [within, of_ground] = [limit, nearer].map(|limit| rim().filter(|r| *r < limit).count() as f64);
+    (of_ground >= CLEAN_SHARE * within).then_some(nearer)
 }
 
 /// Fits the ground to a class of blocks, and finds what stands out from it; `residual` is memory to be used again.
@@ -336,15 +422,22 @@ fn fit(blocks: &Blocks, candidate: Candidate, residual: Vec<f32>) -> Ground {
         let of_ground = residuals.iter().zip(&is_ground).filter(|(_, g)| **g);
         let scatter: Vec<f32> = of_ground.step_by(SCATTER_STEP).map(|(r, _)| *r).collect();
         let sigma = median(&scatter) / if ground.surfaces.len() == 1 { NORMAL_MAD } else { LARGEST_OF_THREE };
-        let split = otsu(&residuals);
-        let standing_out = split.mean_above;
+        let histogram = Histogram::of(&residuals);
+        let standing_out = histogram.split(ALL).mean_above;
         ground.scatter = sigma;
         ground.clarity = standing_out / sigma.max(f32::MIN_POSITIVE);
         let outlier = OUTLIER * sigma;
         let outlier = if ground.clarity >= CLASS_CLARITY { outlier.min(standing_out / 2.0) } else { outlier };
         ground.threshold = outlier.max(MIN_RESIDUAL).max(MIN_RELATIVE_RESIDUAL * standing_out);
-        let half = (standing_out / 2.0).max(ground.threshold);
-        // Whatever is nearer to the ground than to the shapes may be ground, shadows included; the next fit is robust.
+        // Whatever is nearer to the ground than to the shapes may be ground, shadows included; the next fit is robust. What lies between the two as a class of its own and not along the rim is print.
+        let mut half = (standing_out / 2.0).max(ground.threshold);
+        let rim = || {
+            let all = blocks.samples.iter().zip(&residuals);
+            all.filter(|(sample, _)| is_along_rim(blocks, sample)).map(|(_, residual)| *residual)
+        };
+        while let Some(nearer) = nearer_class(&histogram, half, sigma, rim) {
+            half = nearer;
+        }
         let mut changed = false;
         for (is_ground, residual) in is_ground.iter_mut().zip(&residuals) {
             let now = *residual < half;

@@ -10,6 +10,9 @@ pub(super) const NOBODY: u32 = u32::MAX;
 /// Greatest depth that is told apart, in blocks: beyond the blur of any edge worth measuring.
 pub(super) const MAX_DEPTH: u8 = 7;
 
+/// Blocks on each side that stand out about one that lies deep within: more than any edge takes.
+const WITHIN: usize = 2;
+
 /// Makes every coarse component own its blocks and the free ones next to them; before, nobody owns any.
 pub(super) fn claim(blocks: &Blocks, coarse: &Components, owner: &mut Vec<u32>) {
     let columns = blocks.columns;
@@ -64,6 +67,25 @@ impl Standing<'_> {
         let blocks = begin + columns.start..begin + columns.end;
         let owners = self.owner[blocks.clone()].iter();
         owners.zip(&self.ground.residual[blocks]).map(move |(owner, r)| (*owner == k as u32) & (*r > threshold))
+    }
+
+    /// Whether blocks deep within what stands out about a component do so by less than half its level, and as no shadow does.
+    pub(super) fn has_weak_part(&self, k: usize, level: f32) -> bool {
+        let (columns, rows) = (self.blocks.columns, self.blocks.rows);
+        let (c, weak) = (self.components.list[k], self.ground.weak_threshold());
+        let around = |from: usize| from - WITHIN..from + WITHIN + 1;
+        // What lies along the frame's rim is not known to be deep within.
+        let within = |from: usize, to: usize, count: usize| from.max(WITHIN)..to.min(count.saturating_sub(WITHIN));
+        let across = within(c.left, c.right, columns);
+        let stands_out =
+            |b: usize| self.ground.residual[b] > weak && (self.owner[b] == NOBODY || self.owner[b] == k as u32);
+        within(c.top, c.bottom, rows).filter(|_| across.start < across.end).any(|row| {
+            let line = self.ground.residual[row * columns..][across.clone()].iter().zip(across.clone());
+            line.filter(|(r, _)| (weak..level / 2.0).contains(*r)).any(|(_, column)| {
+                around(row).all(|v| around(column).all(|u| stands_out(v * columns + u)))
+                    && !self.ground.may_be_shaded(self.blocks, (column, row))
+            })
+        })
     }
 
     /// The box of a component with what hangs together with it and is no ground either, unless it belongs to another one; at most half the

@@ -10,6 +10,11 @@ use nalgebra::{Matrix6, Vector6};
 /// Residuals that tell how far samples scatter: a median of a thousand is known to a thirtieth.
 const SPREAD_SAMPLES: usize = 1_000;
 
+/// Rounds of leaving out what lies far from a fit, at most.
+const ROUNDS: usize = 6;
+/// One in so many samples that come or go change a fit by little.
+const FEW: usize = 50;
+
 /// A quadratic surface over a frame or a part of it, in block coordinates scaled to -1..1.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Surface {
@@ -19,22 +24,34 @@ pub(super) struct Surface {
 
 impl Surface {
     /// Least squares fit to the levels of blocks (column, row, level) of a picture of so many columns and rows, repeated without what lies
-    /// far from the first fit (specks, shadows): beyond three deviations.
+    /// far from the fit before (specks, shadows, print): beyond three deviations.
     pub(super) fn fit(size: [usize; 2], levels: impl Iterator<Item = ([f64; 2], f32)>) -> Self {
         let scale = size.map(|n| 2.0 / (n.max(2) - 1) as f64);
         let samples: Vec<([f64; 2], f64)> =
             levels.map(|(place, level)| (scaled(scale, place), f64::from(level))).collect();
         let mut sums = NormalEquations::default();
         widely!(sums.add_all(&samples));
-        let first = Self { coefficients: sums.solve(), scale };
-        let mut residuals = vec![0.0; samples.len()];
-        widely!(first.fill_residuals(&samples, &mut residuals));
-        let few = residuals.iter().step_by((residuals.len() / SPREAD_SAMPLES).max(1));
-        let limit = (3.0 / NORMAL_MAD * median(&few.copied().collect::<Vec<_>>())).max(1.0);
-        for ((place, level), _) in samples.iter().zip(&residuals).filter(|(_, residual)| **residual > limit) {
-            sums.add(*place, *level, -1.0);
+        let mut surface = Self { coefficients: sums.solve(), scale };
+        let (mut residuals, mut is_kept) = (vec![0.0; samples.len()], vec![true; samples.len()]);
+        for _ in 0..ROUNDS {
+            widely!(surface.fill_residuals(&samples, &mut residuals));
+            let few = residuals.iter().step_by((residuals.len() / SPREAD_SAMPLES).max(1));
+            let limit = (3.0 / NORMAL_MAD * median(&few.copied().collect::<Vec<_>>())).max(1.0);
+            let mut changed = 0;
+            for (((place, level), residual), is_kept) in samples.iter().zip(&residuals).zip(&mut is_kept) {
+                let keep = *residual <= limit;
+                if keep != *is_kept {
+                    sums.add(*place, *level, if keep { 1.0 } else { -1.0 });
+                    *is_kept = keep;
+                    changed += 1;
+                }
+            }
+            surface.coefficients = sums.solve();
+            if changed * FEW <= samples.len() {
+                break;
+            }
         }
-        Self { coefficients: sums.solve(), scale }
+        surface
     }
 
     /// Level at a block.
