@@ -331,7 +331,7 @@ fn rim_class(values: &[f32], histogram: &Histogram, rim: &[f32], class: Range<f3
     let is_ground = |part: &Range<f32>| {
         along_rim > 0.0
             && count(rim, part) >= CLEAN_SHARE * along_rim
-            && count(values, part) >= LEAST_SHARE * all
+            && (LEAST_SHARE * all..all).contains(&count(values, part))
             && is_apart(histogram, &class, &split, part)
     };
     let parts = [class.start..split.threshold, split.threshold..class.end];
