@@ -45,8 +45,6 @@ pub(super) struct Crop {
     pub(super) noise_level: f32,
     /// Contrast in the grey levels of the frame.
     pub(super) contrast: f32,
-    /// Whether that is one of print, block by block.
-    pub(super) is_print: bool,
     /// Whether parts of it may come near the ground's level: it is print, or has weak blocks.
     pub(super) may_be_more: bool,
 }
@@ -57,8 +55,7 @@ impl Crop {
         let Standing { blocks, ground, components, owner } = *standing;
         let (block, columns) = (blocks.size, blocks.columns);
         let levels = Levels::of(standing, k);
-        self.is_print = levels.is_print();
-        self.may_be_more = self.is_print || standing.has_weak_part(k, levels.contrast);
+        self.may_be_more = levels.is_print() || standing.has_weak_part(k, levels.contrast);
         let c = if self.may_be_more { standing.reach(k) } else { components.list[k] };
         let margin = MARGIN + block;
         let mut rows = RowSource { frame, ground, block, lines: Default::default() };

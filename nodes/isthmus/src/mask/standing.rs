@@ -69,6 +69,12 @@ impl Standing<'_> {
         owners.zip(&self.ground.residual[blocks]).map(move |(owner, r)| (*owner == k as u32) & (*r > threshold))
     }
 
+    /// Whether a block is no ground, and no other component's.
+    fn may_be_of(&self, k: usize, block: usize) -> bool {
+        let owner = self.owner[block];
+        self.ground.residual[block] > self.ground.weak_threshold() && (owner == NOBODY || owner == k as u32)
+    }
+
     /// Whether blocks deep within what stands out about a component do so by less than half its level, and as no shadow does.
     pub(super) fn has_weak_part(&self, k: usize, level: f32) -> bool {
         let (columns, rows) = (self.blocks.columns, self.blocks.rows);
@@ -77,12 +83,10 @@ impl Standing<'_> {
         // What lies along the frame's rim is not known to be deep within.
         let within = |from: usize, to: usize, count: usize| from.max(WITHIN)..to.min(count.saturating_sub(WITHIN));
         let across = within(c.left, c.right, columns);
-        let stands_out =
-            |b: usize| self.ground.residual[b] > weak && (self.owner[b] == NOBODY || self.owner[b] == k as u32);
         within(c.top, c.bottom, rows).filter(|_| across.start < across.end).any(|row| {
             let line = self.ground.residual[row * columns..][across.clone()].iter().zip(across.clone());
             line.filter(|(r, _)| (weak..level / 2.0).contains(*r)).any(|(_, column)| {
-                around(row).all(|v| around(column).all(|u| stands_out(v * columns + u)))
+                around(row).all(|v| around(column).all(|u| self.may_be_of(k, v * columns + u)))
                     && !self.ground.may_be_shaded(self.blocks, (column, row))
             })
         })
@@ -92,11 +96,6 @@ impl Standing<'_> {
     /// box's longer side beyond it.
     pub(super) fn reach(&self, k: usize) -> Component {
         let (columns, rows) = (self.blocks.columns, self.blocks.rows);
-        let weak = self.ground.weak_threshold();
-        let is_of = |block: usize| {
-            let owner = self.owner[block];
-            self.ground.residual[block] > weak && (owner == NOBODY || owner == k as u32)
-        };
         let mut reach = self.components.list[k];
         let most = (reach.right - reach.left).max(reach.bottom - reach.top) / 2;
         let within = |from: usize, to: usize, count: usize| from.saturating_sub(most)..count.min(to + most);
@@ -112,7 +111,7 @@ impl Standing<'_> {
             (reach.top, reach.bottom) = (reach.top.min(row), reach.bottom.max(row + 1));
             for v in row.saturating_sub(1).max(down.start)..down.end.min(row + 2) {
                 for u in column.saturating_sub(1).max(across.start)..across.end.min(column + 2) {
-                    if is_of(v * columns + u) && !std::mem::replace(&mut known[at(u, v)], true) {
+                    if self.may_be_of(k, v * columns + u) && !std::mem::replace(&mut known[at(u, v)], true) {
                         open.push((u, v));
                     }
                 }
