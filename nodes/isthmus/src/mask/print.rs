@@ -24,8 +24,10 @@ use std::collections::VecDeque;
 const MOST_PIXELS: usize = 1 << 22;
 /// A weak part has so many pixels: fewer are what noise leaves of an edge.
 const LEAST_PART: usize = 12;
-/// Print of less than one in so many of a shape's pixels is not worth another border: the blocks' is smoother.
+/// Print of less than one in so many of a shape's pixels changes the border only beside parts of so many pixels: elsewhere the blocks' is
+/// smoother, and smaller parts are as often shade between pieces that touch.
 const LEAST_SHARE: usize = 1_000;
+const LEAST_ALONE: usize = 20;
 /// Depths that are told apart, in pixels: no edge worth measuring is wider.
 const MAX_DEPTH: u8 = 24;
 /// An edge's blur is left behind where the median level is this part of the shape's: in the blocks' levels, which are those of deep within, and in levels by near places.
@@ -170,11 +172,21 @@ impl Print {
         let trial: Vec<f32> = (0..self.length.len()).map(|k| self.relative(k, k)).collect();
         self.follow(&trial)?;
         let crispness = self.crispness(&parts, &nearest);
-        let counts = |(crispness, list): (&f32, &Vec<usize>)| if *crispness >= CRISP { list.len() } else { 0 };
-        let lost: usize = crispness.iter().zip(&parts.lists).skip(1).map(counts).sum();
-        if lost < LEAST_PART || lost * LEAST_SHARE < area {
+        let is_print: Vec<bool> = crispness.iter().enumerate().map(|(part, c)| part > 0 && *c >= CRISP).collect();
+        let lost: usize = is_print.iter().zip(&parts.lists).map(|(is, list)| if *is { list.len() } else { 0 }).sum();
+        if lost < LEAST_PART {
             return None;
         }
+        let is_beside = if lost * LEAST_SHARE < area {
+            let counts = |part: usize| part < NOWHERE && is_print[part] && parts.lists[part].len() >= LEAST_ALONE;
+            let is_nearest: Vec<bool> = nearest.iter().map(|part| counts(*part)).collect();
+            if !is_nearest.contains(&true) {
+                return None;
+            }
+            self.dilated(&is_nearest, BEYOND)
+        } else {
+            vec![true; nearest.len()]
+        };
         let level = |k: usize| match crispness.get(nearest[k]) {
             Some(crispness) if *crispness >= SOFT => self.relative(k, k),
             _ => by_blocks[k],
@@ -188,7 +200,7 @@ impl Print {
             _ => self.relative(k, k),
         };
         let near: Vec<f32> = (0..self.length.len()).map(result).collect();
-        let is_elsewhere = self.is_elsewhere(by_blocks, &near);
+        let is_elsewhere = self.is_elsewhere(by_blocks, &near, &is_beside);
         let chosen = near.iter().zip(by_blocks).zip(is_elsewhere);
         Some(chosen.map(|((near, by_blocks), is_elsewhere)| if is_elsewhere { *near } else { *by_blocks }).collect())
     }
@@ -336,10 +348,11 @@ impl Print {
         (0..shape.len()).map(|k| closed[k] && stands_out[k] && !shape[k]).collect()
     }
 
-    /// Where two borders are apart by more than a pixel or two, and about there.
-    fn is_elsewhere(&self, a: &[f32], b: &[f32]) -> Vec<bool> {
+    /// Where two borders are apart by more than a pixel or two, and about there; only where that `matters`.
+    fn is_elsewhere(&self, a: &[f32], b: &[f32], matters: &[bool]) -> Vec<bool> {
         let between: Vec<bool> = a.iter().zip(b).map(|(a, b)| (*a > 0.5) != (*b > 0.5)).collect();
-        let apart: Vec<bool> = self.shares(&between, APART).map(|share| share > LEAST_APART).collect();
+        let shares = self.shares(&between, APART).zip(matters);
+        let apart: Vec<bool> = shares.map(|(share, matters)| share > LEAST_APART && *matters).collect();
         self.dilated(&apart, BEYOND)
     }
 
