@@ -172,14 +172,12 @@ impl Print {
         let trial: Vec<f32> = (0..self.length.len()).map(|k| self.relative(k, k)).collect();
         self.follow(&trial)?;
         let crispness = self.crispness(&parts, &nearest);
-        let is_print: Vec<bool> = crispness.iter().enumerate().map(|(part, c)| part > 0 && *c >= CRISP).collect();
-        let lost: usize = is_print.iter().zip(&parts.lists).map(|(is, list)| if *is { list.len() } else { 0 }).sum();
-        if lost < LEAST_PART {
-            return None;
-        }
+        let is_print = |part: usize| part > 0 && crispness.get(part).is_some_and(|crispness| *crispness >= CRISP);
+        let lost: usize =
+            (0..parts.lists.len()).filter(|part| is_print(*part)).map(|part| parts.lists[part].len()).sum();
         let is_beside = if lost * LEAST_SHARE < area {
-            let counts = |part: usize| part < NOWHERE && is_print[part] && parts.lists[part].len() >= LEAST_ALONE;
-            let is_nearest: Vec<bool> = nearest.iter().map(|part| counts(*part)).collect();
+            let counts = |part: &usize| is_print(*part) && parts.lists[*part].len() >= LEAST_ALONE;
+            let is_nearest: Vec<bool> = nearest.iter().map(counts).collect();
             if !is_nearest.contains(&true) {
                 return None;
             }
