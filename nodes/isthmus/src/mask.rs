@@ -60,6 +60,7 @@ pub use crate::cutout::{Aoi, Cutout};
 pub use frame::{Frame, MAX_SIDE, MaskError, PixelFormat};
 pub use segmentation::{MIN_REPORTED_AREA, Parameters, Reason, Rejected, Segmentation};
 
+use crate::contour::Tracer;
 use blocks::Blocks;
 use crop::Crop;
 use ground::Ground;
@@ -89,6 +90,7 @@ pub struct Segmenter {
     threads: Threads,
     shadows: Shadows,
     print: Print,
+    tracer: Tracer,
 }
 
 impl Segmenter {
@@ -179,7 +181,7 @@ impl Segmenter {
             self.collect(frame, parameters, beside, &mut found, &mut rejected);
         }
         standing::release(blocks, &self.coarse, &mut self.owner);
-        sift(frame, parameters, found, rejected)
+        sift(frame, parameters, found, rejected, &mut self.tracer)
     }
 
     /// Takes the components of `self.crop` over, each as a cutout, or among the rejected.

@@ -7,7 +7,7 @@
 use super::runs::{Component, Components};
 use super::statistics::median;
 use crate::Point;
-use crate::contour::Border;
+use crate::contour::{Border, Tracer};
 use crate::cutout::Cutout;
 use std::ops::RangeInclusive;
 
@@ -21,9 +21,12 @@ const MAX_EDGE_REACH: f64 = 6.0;
 const CRISP_EDGE: f64 = 0.6;
 
 /// How far from the border, in pixels, its step is measured, the shape beside it, and the ground: about the edge's blur, and beyond it.
-const STEP: RangeInclusive<i32> = 2..=3;
-const SHAPE: RangeInclusive<i32> = 3..=5;
-const GROUND: RangeInclusive<i32> = 3..=6;
+const STEP: RangeInclusive<usize> = NEAREST..=3;
+const SHAPE: RangeInclusive<usize> = 3..=5;
+const GROUND: RangeInclusive<usize> = 3..=FARTHEST;
+const NEAREST: usize = 2;
+const FARTHEST: usize = 6;
+const DEPTH: usize = FARTHEST - NEAREST + 1;
 /// Points of a border on either side of one whose levels are averaged with its own, against noise.
 const ALONG: usize = 6;
 /// Most difference of the ground beside a told border from that along most of it, as a part of the contrast: pieces on plain ground have less than half of it.
@@ -41,37 +44,41 @@ const LEAST_HOLE: f64 = 0.04;
 struct Across<'a> {
     cutout: &'a Cutout,
     border: Border,
+    /// One by the contrast.
+    scale: f32,
 }
 
 impl<'a> Across<'a> {
-    fn new(cutout: &'a Cutout) -> Option<Self> {
-        let (border, _) = Border::from_cutout(cutout).ok()?;
-        Some(Self { cutout, border })
+    fn new(cutout: &'a Cutout, tracer: &mut Tracer) -> Option<Self> {
+        let (border, _) = tracer.trace(cutout).ok()?;
+        Some(Self { cutout, border, scale: 1.0 / (cutout.shape_level - cutout.ground_level) })
     }
 
     /// The way out of the shape at a point of the border.
     fn outwards(&self, k: usize) -> nalgebra::Vector2<f64> {
         let points = &self.border.points;
-        let n = points.len();
-        let along = (points[(k + 1) % n] - points[(k + n - 1) % n]).normalize();
+        let last = points.len() - 1;
+        let along = (points[if k < last { k + 1 } else { 0 }] - points[if k > 0 { k - 1 } else { last }]).normalize();
         // Clockwise on a screen, y down: the shape is on the right.
         nalgebra::Vector2::new(along.y, -along.x)
     }
 
     /// The level at a place, in parts of the contrast: 0 for ground, 1 for shape.
+    #[inline]
     fn level(&self, p: Point) -> f32 {
-        let Cutout { window, pixels, shape_level, ground_level, .. } = self.cutout;
+        let Cutout { window, pixels, ground_level, .. } = self.cutout;
         let (width, height) = (window.width as i32, window.height as i32);
-        let (x, y) = (p.x.round() as i32 - window.x, p.y.round() as i32 - window.y);
+        // Borders lie within the window, where what a cast cuts off is what rounding down does.
+        let [x, y] = [p.x - f64::from(window.x), p.y - f64::from(window.y)].map(|v| (v + 0.5) as i32);
         let pixel = pixels[(y.clamp(0, height - 1) * width + x.clamp(0, width - 1)) as usize];
-        (f32::from(pixel) - ground_level) / (shape_level - ground_level)
+        (f32::from(pixel) - ground_level) * self.scale
     }
 }
 
 /// Whether the level falls off at the border of a shape rather than all over it: the edge of a piece, however faint, does, those of glare and
 /// shadows don't.
-pub(super) fn has_crisp_edge(cutout: &Cutout) -> bool {
-    let Some(across) = Across::new(cutout) else { return false };
+pub(super) fn has_crisp_edge(cutout: &Cutout, tracer: &mut Tracer) -> bool {
+    let Some(across) = Across::new(cutout, tracer) else { return false };
     let points = &across.border.points;
     let reach = (EDGE_REACH * across.border.area().sqrt()).clamp(MIN_EDGE_REACH, MAX_EDGE_REACH);
     let step = |k: usize| {
@@ -82,8 +89,8 @@ pub(super) fn has_crisp_edge(cutout: &Cutout) -> bool {
 }
 
 /// Whether a part of the border is not told: another line may lie there.
-pub(super) fn is_untold(cutout: &Cutout) -> bool {
-    let Some(across) = Across::new(cutout) else { return false };
+pub(super) fn is_untold(cutout: &Cutout, tracer: &mut Tracer) -> bool {
+    let Some(across) = Across::new(cutout, tracer) else { return false };
     let points = &across.border.points;
     let hole = (largest_hole(cutout) as f64).sqrt();
     if hole > LEAST_HOLE * across.border.area().sqrt() {
@@ -92,14 +99,18 @@ pub(super) fn is_untold(cutout: &Cutout) -> bool {
     let [mut steps, mut shape, mut ground]: [Vec<f32>; 3] = Default::default();
     for (k, point) in points.iter().enumerate() {
         let outwards = across.outwards(k);
-        let mean = |distances: RangeInclusive<i32>, sense: i32| {
-            let count = distances.clone().count() as f32;
-            let level = |distance| across.level(point + f64::from(sense * distance) * outwards).clamp(-1.0, 2.0);
-            distances.map(level).sum::<f32>() / count
+        let levels = |sense: f64| -> [f32; DEPTH] {
+            let level = |distance| across.level(point + sense * distance as f64 * outwards).clamp(-1.0, 2.0);
+            std::array::from_fn(|i| level(i + NEAREST))
         };
-        steps.push(mean(STEP, -1) - mean(STEP, 1));
-        shape.push(mean(SHAPE, -1));
-        ground.push(mean(GROUND, 1));
+        let mean = |levels: &[f32; DEPTH], distances: RangeInclusive<usize>| {
+            let levels = &levels[distances.start() - NEAREST..=distances.end() - NEAREST];
+            levels.iter().sum::<f32>() / levels.len() as f32
+        };
+        let [inside, outside] = [-1.0, 1.0].map(levels);
+        steps.push(mean(&inside, STEP) - mean(&outside, STEP));
+        shape.push(mean(&inside, SHAPE));
+        ground.push(mean(&outside, GROUND));
     }
     let [steps, shape, ground] = [steps, shape, ground].map(|levels| smooth(&levels));
     let [step, level, clear] = [&steps, &shape, &ground].map(|levels| median(levels));
@@ -111,10 +122,9 @@ pub(super) fn is_untold(cutout: &Cutout) -> bool {
 
 /// Means along a border.
 fn smooth(levels: &[f32]) -> Vec<f32> {
-    let n = levels.len();
-    let mean =
-        |k: usize| (0..=2 * ALONG).map(|i| levels[(k + n + i - ALONG) % n]).sum::<f32>() / (2 * ALONG + 1) as f32;
-    (0..n).map(mean).collect()
+    let (head, tail) = (&levels[..ALONG], &levels[levels.len() - ALONG..]);
+    let round = [tail, levels, head].concat();
+    round.windows(2 * ALONG + 1).map(|window| window.iter().sum::<f32>() / window.len() as f32).collect()
 }
 
 /// Area of the largest hole in what a cutout shows, in pixels.

@@ -8,7 +8,7 @@ use super::segmentation::{Parameters, Reason, Rejected, Segmentation};
 use super::shadows::Beside;
 use super::statistics::{median, quantile};
 use crate::Point;
-use crate::contour::Border;
+use crate::contour::{Border, Tracer};
 use crate::cutout::Cutout;
 use crate::isthmus::{self, Polarity};
 use crate::skeleton::Triangulation;
@@ -64,13 +64,14 @@ pub(super) fn sift(
     parameters: &Parameters,
     mut found: Vec<Found>,
     mut rejected: Vec<Rejected>,
+    tracer: &mut Tracer,
 ) -> (Segmentation, bool) {
     let sharpness: Vec<f32> =
         if found.len() > 1 { found.iter().map(|f| sharpness(&f.cutout)).collect() } else { Vec::new() };
     let sharpest = sharpness.iter().copied().fold(0.0, f32::max);
     let mut sharpness = sharpness.into_iter();
     found.retain(|f| {
-        let is_soft = sharpness.next().is_some_and(|s| s < SOFT * sharpest) && !has_crisp_edge(&f.cutout);
+        let is_soft = sharpness.next().is_some_and(|s| s < SOFT * sharpest) && !has_crisp_edge(&f.cutout, tracer);
         if is_soft {
             rejected.push(Rejected { aoi: f.cutout.aoi, area: f.area, reason: Reason::Faint });
         }
@@ -123,7 +124,7 @@ pub(super) fn sift(
     let is_large = |f: &Found| f.area as f64 >= TOUCHING_AREA * median_area as f64;
     // Where large shapes are whole as a rule, shapes are of many sizes, and a waist is no contact.
     let large = found.iter().filter(|f| f.contact == 0 && !f.is_convex && is_large(f));
-    let whole = large.map(|f| contact(&f.cutout, median_area as f64).is_none()).collect::<Vec<_>>();
+    let whole = large.map(|f| contact(&f.cutout, median_area as f64, tracer).is_none()).collect::<Vec<_>>();
     let are_alike = 2 * whole.iter().filter(|is_whole| **is_whole).count() <= whole.len();
     let mut taken: Vec<Found> = Vec::new();
     let mut convex = Vec::new();
@@ -134,13 +135,13 @@ pub(super) fn sift(
         let reason = if (f.area as f64) < parameters.min_relative_area * typical_area as f64 {
             Some(Reason::Small)
         } else if f64::from(f.contrast) < parameters.min_relative_contrast * f64::from(typical_contrast)
-            && !has_crisp_edge(&f.cutout)
+            && !has_crisp_edge(&f.cutout, tracer)
         {
             Some(Reason::Faint)
         } else if f.contact > 0 && !is_tight(&f) {
             Some(if is_strip(&f) { Reason::Thread } else { Reason::CutByFrame })
         } else if is_large(&f)
-            && let Some(contact) = contact(&f.cutout, median_area as f64)
+            && let Some(contact) = contact(&f.cutout, median_area as f64, tracer)
         {
             let parts = part(&f, contact, median_area as f64);
             if parts.is_empty() {
@@ -170,10 +171,11 @@ pub(super) fn sift(
     separated.sort_by_key(|aoi| (aoi.y, aoi.x));
     rejected.sort_by_key(|r| (r.aoi.y, r.aoi.x));
     taken.sort_by_key(|f| (f.cutout.aoi.y, f.cutout.aoi.x));
-    let boxes = |is_meant: &dyn Fn(&Found) -> bool| {
+    let boxes = |is_meant: &mut dyn FnMut(&Found) -> bool| {
         taken.iter().filter(|f| is_meant(f)).map(|f| f.cutout.aoi).collect::<Vec<_>>()
     };
-    let [shaded, untold] = [boxes(&|f| f.beside.is_shaded), boxes(&|f| f.beside.is_doubtful && is_untold(&f.cutout))];
+    let shaded = boxes(&mut |f| f.beside.is_shaded);
+    let untold = boxes(&mut |f| f.beside.is_doubtful && is_untold(&f.cutout, tracer));
     let cutouts = taken.into_iter().map(|f| f.cutout).collect();
     (Segmentation { cutouts, rejected, separated, shaded, untold }, has_bays)
 }
@@ -199,8 +201,8 @@ fn sharpness(cutout: &Cutout) -> f32 {
 }
 
 /// The narrowest place at which two shapes of about a given area each touch: an isthmus with most of a shape on either side.
-fn contact(cutout: &Cutout, area: f64) -> Option<[Point; 2]> {
-    let (border, noise) = Border::from_cutout(cutout).ok()?;
+fn contact(cutout: &Cutout, area: f64, tracer: &mut Tracer) -> Option<[Point; 2]> {
+    let (border, noise) = tracer.trace(cutout).ok()?;
     let triangulation = Triangulation::new(&border).ok()?;
     let whole = border.area();
     let joins_two = |i: &isthmus::Isthmus| {
