@@ -24,6 +24,7 @@ const CRISP_EDGE: f64 = 0.6;
 const STEP: RangeInclusive<usize> = NEAREST..=3;
 const SHAPE: RangeInclusive<usize> = 3..=5;
 const GROUND: RangeInclusive<usize> = 3..=FARTHEST;
+/// Levels are taken from the nearest of these on to the farthest, and how many that are.
 const NEAREST: usize = 2;
 const FARTHEST: usize = 6;
 const DEPTH: usize = FARTHEST - NEAREST + 1;
@@ -120,7 +121,7 @@ pub(super) fn is_untold(cutout: &Cutout, tracer: &mut Tracer) -> bool {
     (0..points.len()).filter(is_untold).count() as f64 >= LEAST_SHARE * points.len() as f64
 }
 
-/// Means along a border.
+/// Means along a border, which has more points than a mean takes on either side ([`crate::contour::MIN_POINTS`]).
 fn smooth(levels: &[f32]) -> Vec<f32> {
     let (head, tail) = (&levels[..ALONG], &levels[levels.len() - ALONG..]);
     let round = [tail, levels, head].concat();
