@@ -69,7 +69,7 @@ impl<'a> Across<'a> {
     fn level(&self, p: Point) -> f32 {
         let Cutout { window, pixels, ground_level, .. } = self.cutout;
         let (width, height) = (window.width as i32, window.height as i32);
-        // Borders lie within the window, where what a cast cuts off is what rounding down does.
+        // A cast cuts off towards zero: within the window that is rounding down, and what lies beyond is clamped.
         let [x, y] = [p.x - f64::from(window.x), p.y - f64::from(window.y)].map(|v| (v + 0.5) as i32);
         let pixel = pixels[(y.clamp(0, height - 1) * width + x.clamp(0, width - 1)) as usize];
         (f32::from(pixel) - ground_level) * self.scale

@@ -171,11 +171,9 @@ pub(super) fn sift(
     separated.sort_by_key(|aoi| (aoi.y, aoi.x));
     rejected.sort_by_key(|r| (r.aoi.y, r.aoi.x));
     taken.sort_by_key(|f| (f.cutout.aoi.y, f.cutout.aoi.x));
-    let boxes = |is_meant: &mut dyn FnMut(&Found) -> bool| {
-        taken.iter().filter(|f| is_meant(f)).map(|f| f.cutout.aoi).collect::<Vec<_>>()
-    };
-    let shaded = boxes(&mut |f| f.beside.is_shaded);
-    let untold = boxes(&mut |f| f.beside.is_doubtful && is_untold(&f.cutout, tracer));
+    let shaded = taken.iter().filter(|f| f.beside.is_shaded).map(|f| f.cutout.aoi).collect();
+    let doubtful = taken.iter().filter(|f| f.beside.is_doubtful);
+    let untold = doubtful.filter(|f| is_untold(&f.cutout, tracer)).map(|f| f.cutout.aoi).collect();
     let cutouts = taken.into_iter().map(|f| f.cutout).collect();
     (Segmentation { cutouts, rejected, separated, shaded, untold }, has_bays)
 }
