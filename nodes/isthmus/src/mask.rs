@@ -83,7 +83,7 @@ pub struct Segmenter {
     blocks: Blocks,
     coarse: Components,
     fine: Components,
-    /// For each block the coarse component that owns it, or [`NOBODY`]: its blocks and those next to them.
+    /// For each block the coarse component that owns it, or [`standing::NOBODY`]: its blocks and those next to them.
     owner: Vec<u32>,
     residual: Vec<f32>,
     crop: Crop,
